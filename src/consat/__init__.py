@@ -1,0 +1,53 @@
+"""consat, collaborative satisfaction: a team of robots that satisfies its private spatial constraints together.
+
+Arrays are held in float64 while consat computes; your own JAX settings stay as they are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
+    from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
+    from consat.result import Result
+    from consat.runner import run
+    from consat.scenario import Scenario, dump, load, loads
+    from consat.settings import Ramp, Settings, Smoothing
+    from consat.team import Agent, Team
+
+_HOME = {
+    "constraints": ("Constraint", "apart", "box", "constraint", "displacement", "expr", "halfspace", "near", "outside", "within"),
+    "errors": (
+        "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
+    ),
+    "result": ("Result",),
+    "runner": ("run",),
+    "scenario": ("Scenario", "dump", "load", "loads"),
+    "settings": ("Ramp", "Settings", "Smoothing"),
+    "team": ("Agent", "Team"),
+}  # fmt: skip
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "Agent", "ConsatError", "Constraint", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
+    "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
+    "expr", "halfspace", "load", "loads", "near", "outside", "run", "within",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used, so that ``import consat`` costs nothing."""
+    if name not in _MODULE:
+        raise AttributeError(f"module 'consat' has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(f"consat.{_MODULE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,213 @@
+"""The command line: no mathematics, only words in and words out. JSON alone on stdout; progress, logs and errors on stderr."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from consat import __version__
+from consat.errors import ConsatError, InvalidInput, InvalidSettings
+
+if TYPE_CHECKING:
+    from consat.scenario import Scenario
+
+DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+scenario_argument = click.argument("scenario", metavar="FILE")
+set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
+
+
+def main() -> NoReturn:
+    """Entry point of the ``consat`` command."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    try:
+        sys.exit(cli.main(standalone_mode=False, prog_name="consat"))
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.exceptions.Abort:
+        sys.exit(INTERRUPTED)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except InvalidInput as error:
+        _complain(str(error))
+        sys.exit(INVALID)
+    except InvalidSettings as error:
+        _complain(f"consat: {error}")
+        sys.exit(USAGE)
+    except ConsatError as error:
+        _complain(f"consat: {error}")
+        sys.exit(FAILED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(FAILED)
+    except OSError as error:
+        _complain(f"consat: {error.filename or ''}: {error.strerror or error}")
+        sys.exit(FAILED)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="consat")
+def cli() -> None:
+    """A team of robots that satisfies its private constraints together.
+
+    FILE is a scenario file, or the name of a packaged scenario such as case-b.
+    """
+
+
+@cli.command()
+@click.argument("name", required=False)
+def init(name: str | None) -> None:
+    """Write a starting scenario to NAME.yaml; a packaged NAME gives a copy of that one."""
+    from consat.scenario import packaged, packaged_text, template
+
+    target = Path(name if name and name.endswith((".yaml", ".yml")) else f"{name or 'scenario'}.yaml")
+    text = packaged_text(name) if name in packaged() else template()
+    try:
+        with target.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise click.UsageError(f"{target} exists already; choose another name") from None
+    click.echo(f"{target} written; now: consat run {target}", err=True)
+
+
+@cli.command()
+@scenario_argument
+@set_option
+@click.option("--protocol", metavar="KIND", help="gradient-flow, proportional-integral or selfish.")
+@click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
+@click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
+@click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End of a flow; implies --stop never.")
+@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end earlier.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there.")
+@click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
+@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@json_option
+def run(
+    scenario: str, overrides: tuple[str, ...], out: Path | None, full: bool, quiet: bool, as_json: bool, **settings: Any
+) -> int:  # fmt: skip
+    """Run the distributed protocol."""
+    _cache_compilations()
+    loaded = _load(scenario, overrides)
+    from consat.runner import run as run_team
+
+    with _progress(quiet or as_json) as progress, _located(loaded):
+        result = run_team(loaded, full=full, progress=progress, **settings)
+    if out is not None:
+        result.summary["result"] = str(out / "result.nc")
+        result.save(out / "result.nc")
+        figures = result.plot(out)
+        if not (quiet or as_json):
+            _say(f"written: {', '.join(str(path) for path in (out / 'result.nc', *figures))}")
+    if as_json:
+        click.echo(json.dumps(result.summary))
+    elif not quiet:
+        click.echo(str(result))
+    if result.summary["ending"] == "interrupted":
+        return INTERRUPTED
+    return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+
+
+@cli.command()
+@scenario_argument
+@set_option
+@json_option
+def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
+    """Check schema, graphs, clusters, the paper's assumptions and the curvature of every constraint."""
+    loaded = _load(scenario, overrides)
+    from consat.assumptions import report
+    from consat.graphs import require_connected
+    from consat.views import words
+
+    findings = report(loaded.team)
+    click.echo(json.dumps(findings) if as_json else words.check(loaded.name, findings))
+    with _located(loaded):
+        require_connected(loaded.team)
+    return DONE
+
+
+@cli.command()
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Where to; beside the result if not given.")
+def plot(result: Path, out: Path | None) -> None:
+    """Draw the figures of a saved RESULT."""
+    from consat.result import Result
+
+    for path in Result.load(result).plot(out or result.parent):
+        click.echo(path)
+
+
+@cli.command()
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="GIF", help="Where to; beside the result if not given.")
+def animate(result: Path, out: Path | None) -> None:
+    """Make an animated GIF of a saved RESULT."""
+    from consat.result import Result
+    from consat.views import animation
+
+    loaded = Result.load(result)
+    with _progress(quiet=False) as progress:
+        click.echo(animation.save(loaded, out or result.with_suffix(".gif"), progress=lambda done: progress(done, None)))
+
+
+def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:
+    from consat.scenario import load
+
+    return load(scenario, overrides)
+
+
+@contextmanager
+def _located(scenario: Scenario) -> Iterator[None]:
+    """Faults that show only later, such as a cluster without links, get their place in the file."""
+    from consat.scenario import located
+
+    try:
+        yield
+    except InvalidInput as error:
+        raise located(error, scenario) from None
+
+
+def _cache_compilations() -> None:
+    """Keep compiled programs between runs, in the user's own cache directory; must come before JAX starts."""
+    os.environ.setdefault("EQX_ON_ERROR", "nan")  # its error callback would forbid caching; the results carry their own status
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[float, float | None], None]]:
+    """A bar on stderr, where that is a terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[margin]}")
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("run", total=1.0, margin="compiling …")
+
+        def update(done: float, margin: float | None) -> None:
+            bar.update(task, completed=done, margin="" if margin is None else f"margin {margin:+.4g}")
+
+        yield update
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+_complain = functools.partial(click.echo, err=True)

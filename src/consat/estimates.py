@@ -1,0 +1,123 @@
+"""Who holds a copy of whose position, and the consensus between copies.
+
+State is one row per copy (holder, position), ordered by holder, so an agent's rows stand together. "full" is the paper's layout: every
+agent holds every position of its cluster. "local" holds only what is needed: every convergence proof of the
+full scheme carries over, since the null space of the block Laplacian is still "all copies of each x_j agree" (arXiv 2203.00681, 1805.08460).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.errors import InvalidSettings
+from consat.graphs import cluster_links, clusters, holders, require_connected
+from consat.numerics import Groups
+from consat.team import Team
+
+Layout = Literal["full", "local"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Exchange:
+    """The messages between copies: one directed edge for each pair of linked agents that both hold a position.
+
+    Attributes:
+        sender: (E,) row whose value arrives; the edges are ordered by receiver.
+        arrivals: groups the edges by receiving row.
+        block: rows move in blocks of this many: the agents' whole estimates where all hold all, else single rows.
+    """
+
+    sender: Array
+    arrivals: Groups
+    block: int = field(metadata={"static": True})
+
+    def disagreement(self, message: Any) -> Any:
+        """Σ_j (m_i − m_j) over the neighbours j that share the copy: the Laplacian, applied to every (rows, …) array of `message`."""
+
+        def laplacian(m: Array) -> Array:
+            blocks = m.reshape(-1, self.block, *m.shape[1:])
+            return self.arrivals.sum(self.arrivals.spread(blocks) - blocks[self.sender]).reshape(m.shape)
+
+        return jax.tree.map(laplacian, message)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """The copies of a team under one layout.
+
+    Attributes:
+        layout: ``full`` or ``local``.
+        holder: (C,) who holds each copy.
+        position: (C,) whose position it is.
+        own: (N,) the row of each agent's own position.
+        edges: (E, 2) directed edges (receiver, sender) between copies of the same position on linked agents, by receiver.
+        cluster: (N,) the cluster of each agent.
+        links: (L, 2) the links that carry messages.
+    """
+
+    layout: Layout
+    holder: np.ndarray
+    position: np.ndarray
+    own: np.ndarray
+    edges: np.ndarray
+    cluster: np.ndarray
+    links: np.ndarray
+
+    @classmethod
+    def of(cls, team: Team, layout: Layout) -> Estimates:
+        """Raises: InvalidTeam: where a cluster is not connected (Assumption 1). InvalidSettings: no such layout."""
+        if layout not in get_args(Layout):
+            raise InvalidSettings(f"estimates is {layout!r}, but must be one of {', '.join(get_args(Layout))}")
+        require_connected(team)
+        cluster = clusters(team)
+        pairs = holders(team, cluster) if layout == "local" else _everyone(cluster)
+        links = cluster_links(team, cluster)
+        own = np.flatnonzero(pairs[:, 0] == pairs[:, 1]).astype(np.int32)
+        return cls(layout, pairs[:, 0], pairs[:, 1], own, _shared(pairs, links, team.count), cluster, links)
+
+    @property
+    def count(self) -> int:
+        """C, the number of copies."""
+        return len(self.holder)
+
+    def rows(self, holder: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """The rows of the copies (holder, position), which must exist; any shape, int32."""
+        count = len(self.own)
+        keys = self.holder.astype(np.int64) * count + self.position
+        return np.searchsorted(keys, holder.astype(np.int64) * count + position).astype(np.int32)
+
+    def exchange(self) -> Exchange:
+        """The edges as arrays for the device."""
+        agents = len(self.own)
+        if self.count == agents**2 and self.count:  # everyone holds everything: one Laplacian for all positions
+            both = np.concatenate([self.links, self.links[:, ::-1]])
+            both = both[np.lexsort((both[:, 1], both[:, 0]))]
+            return Exchange(jnp.asarray(both[:, 1]), Groups.of(both[:, 0], agents), agents)
+        return Exchange(jnp.asarray(self.edges[:, 1]), Groups.of(self.edges[:, 0], self.count), 1)
+
+
+def _everyone(cluster: np.ndarray) -> np.ndarray:
+    order = np.argsort(cluster, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1)
+    pairs = np.concatenate([np.stack([np.repeat(group, len(group)), np.tile(group, len(group))], axis=1) for group in members])
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int32)
+
+
+def _shared(pairs: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
+    """Edges between rows: for each link and direction, the positions that both ends hold."""
+    keys = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+    both = np.concatenate([links, links[:, ::-1]])
+    offsets = np.searchsorted(pairs[:, 0], np.arange(count + 1))
+    sizes = (offsets[1:] - offsets[:-1])[both[:, 0]]
+    receiver = np.repeat(offsets[both[:, 0]], sizes) + np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    wanted = np.repeat(both[:, 1], sizes).astype(np.int64) * count + pairs[receiver, 1]
+    sender = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    edges = np.stack([receiver, sender], axis=1)[keys[sender] == wanted]
+    return edges[np.lexsort((edges[:, 1], edges[:, 0]))].astype(np.int32)

@@ -1,0 +1,166 @@
+"""Task graph, clusters and communication graph (paper, section IV-A), and who must hold whose position (design, local estimates).
+
+Everything works on arrays of edges; `task_graph` and `communication_graph` give the same as networkx graphs over ids.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+import networkx as nx
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from consat.errors import Fault, InvalidTeam
+from consat.team import Team
+
+
+def task_edges(team: Team) -> np.ndarray:
+    """Edges (i, j) of the task graph: some ψ of i reads x_j; (i, i) where some ψ of i reads x_i alone.
+
+    Returns:
+        (E, 2) int32, sorted, each edge once.
+    """
+    edges = [np.zeros((0, 2), dtype=np.int32)]
+    for family in team.families:
+        for slot in range(family.arity):
+            pairs = np.stack([family.owner, family.agents[:, slot]], axis=1)
+            edges.append(pairs if family.arity == 1 else pairs[pairs[:, 0] != pairs[:, 1]])
+    return _unique_pairs(np.concatenate(edges), team.count)
+
+
+def clusters(team: Team) -> np.ndarray:
+    """The maximal dependency cluster of each agent: the weakly connected components of the task graph.
+
+    Returns:
+        (N,) int32 labels from 0, in the order of their first agents.
+    """
+    return _components(task_edges(team), team.count)
+
+
+def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
+    """The links that carry anything: those inside a cluster; (L', 2) int32."""
+    return team.links[cluster[team.links[:, 0]] == cluster[team.links[:, 1]]]
+
+
+def disconnected(team: Team) -> list[list[list[str]]]:
+    """The clusters whose agents cannot reach one another over the links inside them (Assumption 1).
+
+    Returns:
+        for each such cluster its connected parts, each a list of ids.
+    """
+    cluster = clusters(team)
+    part = _components(cluster_links(team, cluster), team.count)
+    first = np.full(cluster.max() + 1, -1)
+    first[cluster[::-1]] = part[::-1]
+    broken = np.unique(cluster[part != first[cluster]])
+    return [
+        [[team.ids[i] for i in np.flatnonzero((cluster == c) & (part == p))] for p in np.unique(part[cluster == c])] for c in broken
+    ]
+
+
+def require_connected(team: Team) -> None:
+    """Raises: InvalidTeam: where a cluster is not connected by links, naming its parts and a link that would join them."""
+    faults = []
+    for parts in disconnected(team):
+        shown = " and ".join("{" + ", ".join(part[:5]) + (", …" if len(part) > 5 else "") + "}" for part in parts[:4])
+        cure = f"add a link such as [{parts[0][0]}, {parts[1][0]}]"
+        message = f"the constraints tie {shown} together, but no path of links inside their cluster joins them (Assumption 1); {cure}"
+        faults.append(Fault(("communication",), message, "communication"))
+    if faults:
+        raise InvalidTeam(faults)
+
+
+def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
+    """Who holds a copy of whose position under local estimates: i holds x_j if some ψ of i reads x_j, j holds its own, and relays
+    hold it where the links among these alone would leave them in pieces.
+
+    Args:
+        team: whose clusters are connected by links.
+        cluster: (N,) as `clusters` returns.
+
+    Returns:
+        (C, 2) int32 pairs (holder, position), sorted, each once.
+    """
+    own = np.arange(team.count, dtype=np.int32)
+    pairs = _unique_pairs(np.concatenate([task_edges(team), np.stack([own, own], axis=1)]), team.count)
+    relays = list(_relays(pairs, cluster_links(team, cluster), team.count))
+    return _unique_pairs(np.concatenate([pairs, *relays]), team.count) if relays else pairs
+
+
+def _relays(pairs: np.ndarray, links: np.ndarray, count: int) -> Iterator[np.ndarray]:
+    """Extra (holder, position) pairs. Positions whose readers are all linked to their owner need none, and cost no loop."""
+    foreign = pairs[pairs[:, 0] != pairs[:, 1]]
+    linked = np.isin(_keys(np.sort(foreign, axis=1), count), _keys(links, count))
+    remote = np.unique(foreign[~linked, 1])
+    if not len(remote):
+        return
+    neighbours = _adjacency(links, count)
+    by_position = foreign[np.argsort(foreign[:, 1], kind="stable")]
+    starts = np.searchsorted(by_position[:, 1], remote), np.searchsorted(by_position[:, 1], remote, side="right")
+    for position, begin, end in zip(remote, *starts, strict=True):
+        path_holders = _steiner(int(position), set(map(int, by_position[begin:end, 0])), neighbours)
+        yield np.array([(holder, position) for holder in path_holders], dtype=np.int32).reshape(-1, 2)
+
+
+def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> set[int]:
+    """Agents to add so that `root` and `wanted` are connected: again and again the shortest path from what is joined to the nearest
+    that is not (Takahashi, Matsuyama 1980; at most twice the shortest tree)."""
+    joined, added, missing = {root}, set[int](), set(wanted)
+    while missing:
+        parent: dict[int, int] = dict.fromkeys(joined, -1)
+        queue = deque(sorted(joined))
+        while queue:
+            agent = queue.popleft()
+            if agent in missing:
+                break
+            for other in map(int, neighbours[agent]):
+                if other not in parent:
+                    parent[other] = agent
+                    queue.append(other)
+        while agent not in joined:
+            joined.add(agent)
+            missing.discard(agent)
+            if agent not in wanted:
+                added.add(agent)
+            agent = parent[agent]
+    return added
+
+
+def task_graph(team: Team) -> nx.DiGraph:
+    """The task graph over ids, with self-edges."""
+    graph = nx.DiGraph()
+    graph.add_nodes_from(team.ids)
+    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in task_edges(team))
+    return graph
+
+
+def communication_graph(team: Team) -> nx.Graph:
+    """The communication graph over ids."""
+    graph = nx.Graph()
+    graph.add_nodes_from(team.ids)
+    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in team.links)
+    return graph
+
+
+def _keys(pairs: np.ndarray, count: int) -> np.ndarray:
+    return pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+
+
+def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    keys = np.unique(_keys(pairs, count))
+    return np.stack([keys // count, keys % count], axis=1).astype(np.int32)
+
+
+def _components(edges: np.ndarray, count: int) -> np.ndarray:
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    labels: np.ndarray = connected_components(graph, directed=False)[1]
+    return labels.astype(np.int32)
+
+
+def _adjacency(links: np.ndarray, count: int) -> list[np.ndarray]:
+    both = np.concatenate([links, links[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    return np.split(both[:, 1], np.searchsorted(both[:, 0], np.arange(1, count)))

@@ -1,0 +1,138 @@
+"""How numbers are held: float64 for the duration of a call, and groups of unequal size as arrays of equal rows."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+PADDING_LIMIT = 4
+"""Groups are padded to the largest while that costs at most this many times the elements; beyond, they are scattered."""
+
+
+def float64(function: Callable[P, T]) -> Callable[P, T]:
+    """Run `function` with JAX in double precision, and leave the caller's own JAX settings as they were."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        with jax.enable_x64(True):
+            return function(*args, **kwargs)
+
+    return wrapped
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Groups:
+    """Elements that belong to groups: constraints to agents, gradients to rows, links to rows.
+
+    Sums and maxima over the groups are a reshape where all groups are alike, else a gather through a padded index, else,
+    for very uneven groups such as the hub of a star, a sorted scatter.
+
+    Attributes:
+        group: (E,) the group of each element.
+        index: (G, width) the elements of each group, padded with E; or (E,) elements in the order of their groups; or None when
+            the elements lie in order and all groups have the same size.
+        count: G.
+        width: size of the largest group.
+        padded: whether `index` is the padded form.
+    """
+
+    group: Array
+    index: Array | None
+    count: int = field(metadata={"static": True})
+    width: int = field(metadata={"static": True})
+    padded: bool = field(metadata={"static": True})
+
+    @classmethod
+    def of(cls, group: np.ndarray, count: int) -> Groups:
+        """Args: group: (E,) int, the group of each element; count: how many groups there are."""
+        group = np.asarray(group, dtype=np.int32)
+        sizes = np.bincount(group, minlength=count)
+        width = int(sizes.max(initial=0))
+        if count * width == len(group) and np.all(group[1:] >= group[:-1]):
+            return cls(group, None, count, width, padded=True)
+        order = np.argsort(group, kind="stable").astype(np.int32)
+        if count * width > PADDING_LIMIT * max(len(group), count):
+            return cls(group, order, count, width, padded=False)
+        index = np.full((count, width), len(group), dtype=np.int32)
+        ranked = group[order]
+        index[ranked, np.arange(len(group)) - (np.cumsum(sizes) - sizes)[ranked]] = order
+        return cls(group, index, count, width, padded=True)
+
+    def spread(self, values: Array) -> Array:
+        """(G, …) → (E, …): to each element the value of its group."""
+        if self.index is None:
+            return values if self.width == 1 else jnp.repeat(values, self.width, axis=0, total_repeat_length=self.count * self.width)
+        return values[self.group]
+
+    def gather(self, elements: Array, empty: float) -> Array:
+        """(E, …) → (G, width, …), short groups filled with `empty`. Only for the padded form."""
+        if self.index is None:
+            return elements.reshape(self.count, self.width, *elements.shape[1:])
+        filler = jnp.full((1, *elements.shape[1:]), empty, elements.dtype)
+        return jnp.concatenate([elements, filler])[self.index]
+
+    def sum(self, elements: Array) -> Array:
+        """(E, …) → (G, …): the sum over each group, 0 for an empty one."""
+        if not self.padded:
+            assert self.index is not None
+            return jax.ops.segment_sum(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
+        if self.index is None and self.width == 1:
+            return elements
+        return jnp.sum(self.gather(elements, 0.0), axis=1)
+
+    def max(self, elements: Array) -> Array:
+        """(E, …) → (G, …): the maximum over each group, −∞ for an empty one."""
+        if not self.padded:
+            assert self.index is not None
+            return jax.ops.segment_max(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
+        if self.index is None and self.width == 1:
+            return elements
+        return jnp.max(self.gather(elements, -jnp.inf), axis=1, initial=-jnp.inf)
+
+    def logsumexp(self, elements: Array) -> tuple[Array, Array]:
+        """(E,) → (G,) and (E,): log Σ exp over each group, −∞ for an empty one, and the softmax weights within the group."""
+        top = jax.lax.stop_gradient(self.max(elements))
+        shift = jnp.where(jnp.isfinite(top), top, 0.0)
+        powers = jnp.exp(elements - self.spread(shift))
+        total = self.sum(powers)
+        weights = powers / self.spread(jnp.where(total > 0.0, total, 1.0))
+        return jnp.where(total > 0.0, jnp.log(jnp.where(total > 0.0, total, 1.0)) + shift, -jnp.inf), weights
+
+
+class CompileClock:
+    """Tells, within a `with` block, the seconds that JAX spent tracing and compiling from those spent running."""
+
+    def __init__(self) -> None:
+        self._spans: list[tuple[float, float]] = []
+        self._begin = 0.0
+        self.seconds: dict[str, float] = {"compile": 0.0, "run": 0.0}
+
+    def __enter__(self) -> CompileClock:
+        self._begin = time.perf_counter()
+        jax.monitoring.register_event_time_span_listener(self._hear)
+        return self
+
+    def _hear(self, event: str, start: float, end: float, **_: str | int) -> None:
+        if event.startswith("/jax/core/compile/"):
+            self._spans.append((start, end))
+
+    def __exit__(self, *_: object) -> None:
+        jax.monitoring.unregister_event_time_span_listener(self._hear)
+        total = time.perf_counter() - self._begin
+        compile_, reached = 0.0, -np.inf
+        for start, end in sorted(self._spans):  # traces nest, so their spans overlap
+            compile_ += max(0.0, end - max(start, reached))
+            reached = max(reached, end)
+        self.seconds.update(compile=compile_, run=max(total - compile_, 0.0))

@@ -1,0 +1,195 @@
+"""Margins, smooth margins and local objectives (paper, section IV-B to IV-D), in the log domain throughout.
+
+    ᾱ_i = min_k ψ_ik                      agent margin
+    β̄   = min_i ᾱ_i                      margin of the team
+    α_i = −(1/ν_α) ln Σ_k e^{−ν_α ψ_ik}   smooth agent margin (eq. 7)
+    β   = −(1/ν_β) ln Σ_i e^{−ν_β α_i}    smooth margin (eq. 9)
+    f_i = e^{−ν_β α_i}                    local objective (eq. 15), only ever held as ln f_i = −ν_β α_i
+    p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.numerics import Groups
+from consat.settings import Ramp, Smoothing
+from consat.team import Family, Team
+
+
+class Nu(NamedTuple):
+    """The smoothing ν_α, ν_β > 0 in force, in units of 1/ψ."""
+
+    alpha: Array | float
+    beta: Array | float
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Schedule:
+    """ν_α constant, ν_β(t) = min(start + rate·t, to): the paper's ramp (section IV-F); a constant where start = to.
+
+    Attributes:
+        nu_alpha: ν_α.
+        start: ν_β(0).
+        to: the final ν_β.
+        rate: 1/s.
+    """
+
+    nu_alpha: Array
+    start: Array
+    to: Array
+    rate: Array
+
+    @classmethod
+    def of(cls, smoothing: Smoothing) -> Schedule:
+        """The schedule that a scenario asks for."""
+        beta = smoothing.nu_beta
+        start, to, rate = (beta.start, beta.to, beta.rate) if isinstance(beta, Ramp) else (beta, beta, 0.0)
+        return cls(*(jnp.asarray(value, dtype=float) for value in (smoothing.nu_alpha, start, to, rate)))
+
+    def at(self, time: Array | float) -> Nu:
+        """ν at a time of a flow, s."""
+        return Nu(self.nu_alpha, jnp.minimum(self.start + self.rate * time, self.to))
+
+    @property
+    def final(self) -> Nu:
+        """ν when the ramp is over; what discrete protocols use throughout."""
+        return Nu(self.nu_alpha, self.to)
+
+    @property
+    def duration(self) -> float:
+        """How long the ramp lasts, s."""
+        return float((self.to - self.start) / self.rate) if self.to > self.start else 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Batch:
+    """A family on the device: where its arguments stand among the rows of a state.
+
+    Attributes:
+        rows: (M_f, arity) int32.
+        parameters: arrays with leading axis M_f.
+        weight: (M_f,).
+        psi: the shared function.
+    """
+
+    rows: Array
+    parameters: Mapping[str, Array]
+    weight: Array
+    psi: Callable[..., Any] = field(metadata={"static": True})
+
+    def value(self, arguments: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
+        """The weighted ψ of one member at its (arity, d) arguments."""
+        return weight * self.psi(*arguments, **parameters)
+
+    def values(self, x: Array) -> Array:
+        """(M_f,) weighted ψ at a state (rows, d)."""
+        return jax.vmap(self.value)(x[self.rows], self.parameters, self.weight)
+
+    def gradients(self, x: Array) -> tuple[Array, Array]:
+        """(M_f,) values and (M_f, arity, d) gradients with respect to the arguments."""
+        return jax.vmap(jax.value_and_grad(self.value))(x[self.rows], self.parameters, self.weight)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Objective:
+    """The local objectives of some agents over the rows of a state: all agents over all copies, or one agent over its own.
+
+    Attributes:
+        batches: the families.
+        order: (M,) where each constraint, in the team's order, stands among the batches; None if they are in order already.
+        owners: groups the constraints by agent.
+        arguments: groups the arguments of all constraints, batch after batch, by row.
+    """
+
+    batches: tuple[Batch, ...]
+    order: Array | None
+    owners: Groups
+    arguments: Groups
+
+    @classmethod
+    def of(cls, team: Team, rows: Callable[[Family], np.ndarray], count: int) -> Objective:
+        """The objectives of all agents of a team.
+
+        Args:
+            team: the team.
+            rows: the rows, (M_f, arity), at which the constraints of a family find their arguments.
+            count: how many rows there are.
+        """
+        placed = [(family, rows(family)) for family in team.families]
+        numbers = np.concatenate([np.zeros(0, dtype=np.int32), *(family.number for family in team.families)])
+        in_order = np.array_equal(numbers, np.arange(len(numbers)))
+        flat = np.concatenate([np.zeros(0, dtype=np.int32), *(place.ravel() for _, place in placed)])
+        return cls(
+            batches=tuple(
+                Batch(
+                    jnp.asarray(place, dtype=jnp.int32),
+                    {key: jnp.asarray(value) for key, value in family.parameters.items()},
+                    jnp.asarray(family.weight),
+                    family.psi,
+                )
+                for family, place in placed
+            ),
+            order=None if in_order else jnp.asarray(np.argsort(numbers), dtype=jnp.int32),
+            owners=Groups.of(team.owner, team.count),
+            arguments=Groups.of(flat, count),
+        )
+
+    @classmethod
+    def at_positions(cls, team: Team) -> Objective:
+        """The objectives evaluated at one shared (N, d) array of positions, as an observer of the whole team sees them."""
+        return cls.of(team, lambda family: family.agents, team.count)
+
+    def _in_order(self, values: list[Array]) -> Array:
+        flat = jnp.concatenate(values) if values else jnp.zeros(0)
+        return flat if self.order is None else flat[self.order]
+
+    def psi(self, x: Array) -> Array:
+        """(M,) every weighted ψ_ik, in the team's order."""
+        return self._in_order([batch.values(x) for batch in self.batches])
+
+    def agent_margins(self, x: Array) -> Array:
+        """(N,) ᾱ_i, +∞ for an agent without constraints."""
+        return -self.owners.max(-self.psi(x))
+
+    def log_objective(self, x: Array, nu: Nu) -> Array:
+        """(N,) ln f_i = −ν_β α_i, −∞ for an agent without constraints."""
+        return nu.beta / nu.alpha * self.owners.logsumexp(-nu.alpha * self.psi(x))[0]
+
+    def smooth_margin(self, x: Array, nu: Nu) -> Array:
+        """β, the smooth margin of all agents together; scalar."""
+        return -jax.nn.logsumexp(self.log_objective(x, nu)) / nu.beta
+
+    def multipliers(self, x: Array, nu: Nu) -> Array:
+        """(M,) λ_ik = softmax over all agents and constraints, λ ∝ e^{−ν_β α_i} p_ik: how much each constraint binds."""
+        log_h, weights = self.owners.logsumexp(-nu.alpha * self.psi(x))
+        return self.owners.spread(jax.nn.softmax(nu.beta / nu.alpha * log_h)) * weights
+
+    def ascent(self, x: Array, nu: Nu) -> tuple[Array, Array]:
+        """(N,) ln f_i and (rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the way each agent would go for its own constraints alone."""
+        pairs = [batch.gradients(x) for batch in self.batches]
+        log_h, weights = self.owners.logsumexp(-nu.alpha * self._in_order([values for values, _ in pairs]))
+        by_batch = weights if self.order is None else jnp.zeros_like(weights).at[self.order].set(weights, unique_indices=True)
+        pieces, start = [jnp.zeros((0, x.shape[-1]))], 0
+        for batch, (_, gradients) in zip(self.batches, pairs, strict=True):
+            stop = start + batch.rows.shape[0]
+            pieces.append((by_batch[start:stop, None, None] * gradients).reshape(-1, x.shape[-1]))
+            start = stop
+        return nu.beta / nu.alpha * log_h, self.arguments.sum(jnp.concatenate(pieces))
+
+
+def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, float]:
+    """The paper's interval β ≤ β̄ ≤ β + ln(N)/ν_β + ln(m̄)/ν_α (eq. 11), at one formation; over agents that have constraints."""
+    sizes = team.constraints_per_agent
+    slack = np.log(max(np.count_nonzero(sizes), 1)) / float(nu.beta) + np.log(max(sizes.max(initial=1), 1)) / float(nu.alpha)
+    return smooth_margin, smooth_margin + float(slack)

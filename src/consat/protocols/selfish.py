@@ -1,0 +1,41 @@
+"""Selfish ascent, a baseline (paper, remark 5 on the noncooperative game): every agent climbs its own α_i by its own position alone,
+
+    ẋ_i       = k1 ∂α_i/∂x_i
+    ẋ_j^(i)   = −k2 Σ_l (x_j^(i) − x_j^(l))      for the others' positions, which it only follows
+
+Sends x^(i). It ends in a Nash equilibrium, which need not satisfy constraints that cooperation can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jax import Array
+
+from consat.protocols.base import Local, State
+
+
+@dataclass(frozen=True)
+class Selfish:
+    """See the module.
+
+    Attributes:
+        k1: gain on the ascent.
+        k2: gain with which an agent's copies follow their owners, 1/s.
+    """
+
+    k1: float = 1.0
+    k2: float = 5.0
+    name = "selfish"
+
+    def start(self, x: Array) -> State:
+        return State(x, jnp.zeros_like(x))
+
+    def message(self, state: State) -> Array:
+        return state.x
+
+    def rate(self, state: State, local: Local, disagreement: Array) -> State:
+        climb = local.own * self.k1 * local.ascent(state.x)
+        follow = (1.0 - local.own) * -self.k2 * disagreement
+        return State(x=climb + follow, z=jnp.zeros_like(state.z))

@@ -1,0 +1,87 @@
+"""The natural size of a team, read off its constraints: what ``smoothing: auto`` and a start box that nobody gave are measured in.
+
+A constraint ψ = ½xᵀHx + b·x + c has the scale of its value where it is stationary, s = |c − ½ bᵀH⁺b| (r² for a disc of radius r) and
+the length √(2s/‖H‖) (r). One without curvature has the scale of its gradient over the team's length. So a team in millimetres and the
+same team in kilometres get the same ν·ψ, and take the same rounds.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from consat.numerics import float64
+from consat.settings import Smoothing
+from consat.team import Family, Team
+
+SHARPNESS = 5.0
+"""ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
+MARGIN = 4.0
+"""How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
+
+
+class Scale(NamedTuple):
+    """The natural size of a team.
+
+    Attributes:
+        psi: the scale of ψ, in its units.
+        length: of the positions.
+        center: (d,) mean of the points that constraints on one agent alone point to.
+        spread: largest distance of such a point from the centre on any axis.
+    """
+
+    psi: float
+    length: float
+    center: np.ndarray
+    spread: float
+
+
+@float64
+def scale(team: Team) -> Scale:
+    """Measure a team; 1 where nothing says otherwise."""
+    measured = [_measure(family, team.dimension) for family in team.families]
+    psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
+    bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
+    slope = np.concatenate([np.zeros(0), *(m[2] for m in measured)])
+    centers = np.concatenate([np.zeros((0, team.dimension)), *(m[3] for m in measured)])
+    curved = np.isfinite(psi) & (psi > 0) & (bend > 0)
+    length = float(np.median(np.sqrt(2 * psi[curved] / bend[curved]))) if curved.any() else 1.0
+    flat = np.isfinite(slope) & (slope > 0) & ~curved
+    sizes = np.concatenate([psi[curved], slope[flat] * length])
+    center = centers.mean(axis=0) if len(centers) else np.zeros(team.dimension)
+    spread = float(np.abs(centers - center).max(initial=0.0))
+    return Scale(float(sizes.min(initial=np.inf)) if len(sizes) else 1.0, length, center, spread)
+
+
+def automatic(size: Scale) -> Smoothing:
+    """``smoothing: auto``: ν = `SHARPNESS` over the scale of ψ."""
+    nu = SHARPNESS / size.psi
+    return Smoothing(nu_alpha=nu, nu_beta=nu)
+
+
+def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
+    """(d,) low and (d,) high of where starts are drawn when nobody says."""
+    half = MARGIN * size.length + size.spread
+    return size.center - half, size.center + half
+
+
+def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Scale, ‖H‖ and slope of each member, and the stationary points of those that read one agent alone."""
+
+    def psi(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
+        return family.psi(*x.reshape(family.arity, dimension), **parameters)
+
+    parameters = {key: jnp.asarray(value) for key, value in family.parameters.items()}
+    origin = jnp.zeros(family.arity * dimension)
+    value, b = (np.asarray(a) for a in jax.vmap(jax.value_and_grad(psi), (None, 0))(origin, parameters))
+    hessian = np.asarray(jax.vmap(jax.hessian(psi), (None, 0))(origin, parameters))
+    usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & np.isfinite(hessian).all(axis=(1, 2))
+    value, b, hessian = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (value, b, hessian))
+    stationary = -np.einsum("mij,mj->mi", np.linalg.pinv(hessian, hermitian=True), b)
+    bend = np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0)
+    psi_there = np.abs(value + 0.5 * np.einsum("mi,mi->m", b, stationary)) * family.weight
+    centers = stationary[(bend > 0)] if family.arity == 1 else np.zeros((0, dimension))
+    return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers

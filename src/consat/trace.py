@@ -1,0 +1,74 @@
+"""What a run leaves behind, as plain arrays: every way of running a team, in one process or over a network, ends in a `Trace`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Ending = Literal["satisfied", "settled", "out of time", "diverged", "too stiff", "interrupted"]
+"""Why a run ended."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """A run as it was recorded at T steps.
+
+    Attributes:
+        clock: what `steps` counts: ``time`` in s, or ``round``.
+        steps: (T,).
+        position: (T, N, d) the agents' own positions, in the scenario's unit of length.
+        velocity: (T, N, d) u_i, length/s.
+        margin: (T,) β̄ at the positions.
+        smooth_margin: (T,) β at the positions.
+        agent_margin: (T, N) ᾱ_i.
+        estimate: (T, C, d) all copies, or None where not recorded.
+        integral: (T, C, d) the integral states, or None.
+        holder: (C,) who holds each copy.
+        held: (C,) whose position it is.
+        cluster: (N,) cluster of each agent.
+        ending: why the run ended.
+        satisfied_from: the first step after the last one whose margin was ≤ 0; None if the last margin is.
+        messages: sent in all; None in continuous time.
+        floats_sent: likewise.
+        seconds: spent on ``compile`` and ``run``.
+    """
+
+    clock: Literal["time", "round"]
+    steps: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    margin: np.ndarray
+    smooth_margin: np.ndarray
+    agent_margin: np.ndarray
+    estimate: np.ndarray | None
+    integral: np.ndarray | None
+    holder: np.ndarray
+    held: np.ndarray
+    cluster: np.ndarray
+    ending: Ending
+    satisfied_from: float | None
+    messages: int | None
+    floats_sent: int | None
+    seconds: Mapping[str, float]
+
+
+def satisfied_from(steps: np.ndarray, margin: np.ndarray, *, interpolate: bool) -> float | None:
+    """The first step after the last one whose margin was ≤ 0, or None if the last margin is.
+
+    Args:
+        steps: (T,) rising.
+        margin: (T,).
+        interpolate: for continuous time, whether to find the zero between two samples.
+    """
+    bad = np.flatnonzero(~(margin > 0))
+    if not len(bad):
+        return float(steps[0])
+    last = int(bad[-1])
+    if last == len(steps) - 1:
+        return None
+    if not interpolate or not np.isfinite(margin[last]):
+        return float(steps[last + 1])
+    return float(np.interp(0.0, margin[last : last + 2], steps[last : last + 2]))
