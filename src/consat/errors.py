@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+AT_KEY: Final = -1
+"""As `Fault.offset`: the fault is the key that `Fault.path` ends with, not the value that belongs to it."""
 
 
 class ConsatError(Exception):
     """Base of every error that consat raises on purpose."""
+
+
+class Place(NamedTuple):
+    """A place in a file; line and column count from 1, and are 0 where the file as a whole is meant."""
+
+    line: int = 0
+    column: int = 0
+    file: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+
+NOWHERE: Final = Place()
 
 
 @dataclass(frozen=True, order=True)
@@ -18,14 +37,19 @@ class Fault:
         path: where it stands, as keys and indices into the scenario, e.g. ``("agents", 1, "constraints", 0, "radius")``.
         message: what is wrong and what would be right.
         where: the same place in words a person uses, e.g. ``agent 'a2', constraint 'tether'``; may be empty.
+        offset: 0-based, into the text that stands at `path`, where only a part of it is wrong; or `AT_KEY`.
+        place: the same place in a file, once that is known.
     """
 
     path: tuple[str | int, ...]
     message: str
     where: str = ""
+    offset: int = 0
+    place: Place = NOWHERE
 
     def __str__(self) -> str:
-        return f"{self.where or dotted(self.path) or 'scenario'}: {self.message}"
+        file = f"{self.place}: " if self.place.file else ""
+        return f"{file}{self.where or dotted(self.path) or 'scenario'}: {self.message}"
 
 
 class InvalidInput(ConsatError, ValueError):
@@ -64,6 +88,19 @@ class InvalidResult(ConsatError, ValueError):
 
 class InvalidSettings(ConsatError, ValueError):
     """Settings of a run that do not fit together, e.g. a protocol that does not exist."""
+
+
+def closest(name: Any, known: Iterable[str]) -> str:
+    """``; did you mean 'within'?`` if one of the `known` names is close to `name`, else nothing."""
+    by_lower = {each.lower(): each for each in known}
+    close = difflib.get_close_matches(str(name)[:100].lower(), by_lower, n=1)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
+
+
+def shown(value: Any) -> str:
+    """The value as errors quote it, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "…"
 
 
 def dotted(path: Iterable[str | int]) -> str:

@@ -56,9 +56,7 @@ def disconnected(team: Team) -> list[list[list[str]]]:
     first = np.full(cluster.max() + 1, -1)
     first[cluster[::-1]] = part[::-1]
     broken = np.unique(cluster[part != first[cluster]])
-    return [
-        [[team.ids[i] for i in np.flatnonzero((cluster == c) & (part == p))] for p in np.unique(part[cluster == c])] for c in broken
-    ]
+    return [[[team.ids[i] for i in np.flatnonzero((cluster == c) & (part == p))] for p in np.unique(part[cluster == c])] for c in broken]
 
 
 def require_connected(team: Team) -> None:

@@ -1,11 +1,11 @@
 """Margins, smooth margins and local objectives (paper, section IV-B to IV-D), in the log domain throughout.
 
-    ᾱ_i = min_k ψ_ik                      agent margin
-    β̄   = min_i ᾱ_i                      margin of the team
-    α_i = −(1/ν_α) ln Σ_k e^{−ν_α ψ_ik}   smooth agent margin (eq. 7)
-    β   = −(1/ν_β) ln Σ_i e^{−ν_β α_i}    smooth margin (eq. 9)
-    f_i = e^{−ν_β α_i}                    local objective (eq. 15), only ever held as ln f_i = −ν_β α_i
-    p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)
+ᾱ_i = min_k ψ_ik                      agent margin
+β̄   = min_i ᾱ_i                      margin of the team
+α_i = −(1/ν_α) ln Σ_k e^{−ν_α ψ_ik}   smooth agent margin (eq. 7)
+β   = −(1/ν_β) ln Σ_i e^{−ν_β α_i}    smooth margin (eq. 9)
+f_i = e^{−ν_β α_i}                    local objective (eq. 15), only ever held as ln f_i = −ν_β α_i
+p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)
 """
 
 from __future__ import annotations

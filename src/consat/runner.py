@@ -112,7 +112,9 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale | N
     else:
         low, high = (np.atleast_1d(np.asarray(side, dtype=float)) for side in start.box)
         if len(low) not in (1, d):
-            raise InvalidSettings(f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team")
+            raise InvalidSettings(
+                f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team"
+            )
     random = np.random.default_rng(start.seed)
     drawn = random.uniform(low, high, (team.count, d))
     first = random.uniform(low, high, (copies.count, d))

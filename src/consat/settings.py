@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e100, le=1e100, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e100, allow_inf_nan=False)]
 
 
@@ -18,11 +19,17 @@ def _no_boolean(value: Any) -> Any:
 
 Number = Annotated[Finite, BeforeValidator(_no_boolean)]
 Gain = Annotated[Positive, BeforeValidator(_no_boolean)]
+Box = tuple[Number, Number] | tuple[tuple[Number, ...], tuple[Number, ...]]
 Seed = Annotated[int, Field(ge=0, lt=2**63), BeforeValidator(_no_boolean)]
 
 
+def _rule(message: str) -> PydanticCustomError:
+    """An error whose message needs no rewriting: it says what is wrong and what would be right."""
+    return PydanticCustomError("rule", "{message}", {"message": message})
+
+
 class Model(BaseModel):
-    """Frozen, and says so when a key is unknown."""
+    """Frozen, and says so when a key is unknown. The description of a field says what it must be; errors quote it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
@@ -36,22 +43,22 @@ class Ramp(Model):
         rate: 1/(ψ s).
     """
 
-    start: Gain = Field(alias="from")
-    to: Gain
-    rate: Gain
+    start: Gain = Field(alias="from", description="a positive number")
+    to: Gain = Field(description="a positive number")
+    rate: Gain = Field(description="a positive number")
 
     @model_validator(mode="after")
     def _rises(self) -> Ramp:
         if self.to < self.start:
-            raise ValueError(f"rises from {self.start:g} to {self.to:g}; `to` must not be below `from`")
+            raise _rule(f"the ramp goes from {self.start:g} to {self.to:g}, but must not fall: `to` must be at least `from`")
         return self
 
 
 class Smoothing(Model):
     """ν_α and ν_β of the soft minima (paper, eq. 7 and 9), in units of 1/ψ."""
 
-    nu_alpha: Gain
-    nu_beta: Gain | Ramp
+    nu_alpha: Gain = Field(description="a positive number")
+    nu_beta: Gain | Ramp = Field(description="a positive number, or a ramp such as {from: 0.01, to: 5, rate: 0.022}")
 
 
 class Start(Model):
@@ -62,40 +69,45 @@ class Start(Model):
         seed: of the draw.
     """
 
-    box: tuple[Number, Number] | tuple[tuple[Number, ...], tuple[Number, ...]] | None = None
-    seed: Seed = 0
+    box: Box | None = Field(None, description="[low, high] with low ≤ high: two numbers, or two lists of numbers")
+    seed: Seed = Field(0, description="a whole number from 0 to 2^63 - 1")
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Start:
-        if self.box is not None:
-            low, high = (side if isinstance(side, tuple) else (side,) for side in self.box)
+    @field_validator("box")
+    @classmethod
+    def _ordered(cls, box: Box | None) -> Box | None:
+        if box is not None:
+            low, high = (side if isinstance(side, tuple) else (side,) for side in box)
             if len(low) != len(high) or not all(a <= b for a, b in zip(low, high, strict=True)):
-                raise ValueError(f"box is {[list(s) if isinstance(s, tuple) else s for s in self.box]}, but must be [low, high] with low ≤ high")
-        return self
+                shown = [list(side) if isinstance(side, tuple) else side for side in box]
+                raise _rule(f"box is {shown}, but must be [low, high] with low ≤ high")
+        return box
+
+
+ProtocolKind = Literal["gradient-flow", "proportional-integral", "selfish", "proximal", "admm", "max-min"]
 
 
 class ProtocolSettings(Model):
     """Which protocol, over which estimates, with which gains.
 
     Attributes:
-        kind: a key of `consat.protocols.FLOWS`; None for the default.
+        kind: its name; None for the default.
         estimates: who holds copies: ``local`` what is needed, ``full`` everything (the paper).
         k1: gain on the gradient.
         k2: gain on the disagreement.
     """
 
-    kind: str | None = None
-    estimates: Literal["local", "full"] = "local"
-    k1: Gain | None = None
-    k2: Gain | None = None
+    kind: ProtocolKind | None = Field(None, description=f"one of {', '.join(get_args(ProtocolKind))}")
+    estimates: Literal["local", "full"] = Field("local", description="local or full")
+    k1: Gain | None = Field(None, description="a positive number")
+    k2: Gain | None = Field(None, description="a positive number")
 
 
 class Settings(Model):
     """All of it, with the defaults that apply where nobody says otherwise."""
 
-    start: Start = Start()
-    protocol: ProtocolSettings = ProtocolSettings()
-    smoothing: Smoothing | Literal["auto"] = "auto"
-    until: Gain | None = None
-    rounds: Annotated[int, Field(ge=0)] | None = None
-    stop: Literal["satisfied", "converged", "never"] | None = None
+    start: Start = Field(Start(), description="a mapping such as {box: [-4, 4], seed: 0}")
+    protocol: ProtocolSettings = Field(ProtocolSettings(), description="a mapping such as {kind: admm, estimates: local}")
+    smoothing: Smoothing | Literal["auto"] = Field("auto", description="auto, or a mapping such as {nu_alpha: 5, nu_beta: 5}")
+    until: Gain | None = Field(None, description="a positive number")
+    rounds: Annotated[int, Field(ge=0)] | None = Field(None, description="a whole number")
+    stop: Literal["satisfied", "converged", "never"] | None = Field(None, description="satisfied, converged or never")

@@ -29,6 +29,10 @@ CHUNK = 100
 """Samples between two looks at the stop rule and the progress bar."""
 SETTLED = 1e-4
 """A flow has settled when over `HOLD` no estimate moved by more than this fraction of the largest."""
+MOST_IMPLICIT = 150
+"""Up to this many numbers in the state an implicit solver is quicker, above an explicit one."""
+MOST_STEPS = 100_000
+"""Solver steps between two looks, after which a flow counts as too stiff."""
 MOST_NUMBERS = 1000
 """Estimates and integral states are recorded by default while there are at most this many numbers in each."""
 
@@ -96,24 +100,36 @@ def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> Sta
     return flow.rate(state, local, problem.exchange.disagreement(flow.message(state)))
 
 
-@functools.partial(jax.jit, static_argnames=("flow",))
-def _advance(flow: Flow, problem: Problem, state: State, times: Array) -> tuple[State, Array]:
-    """Integrate from ``times[0]`` and give the states at ``times[1:]``, and whether all went well."""
+@functools.cache
+def _advance() -> Callable[[Flow, Problem, State, Array], tuple[State, Array]]:
+    """The compiled integration, from ``times[0]``: the states at ``times[1:]``, and whether all went well."""
     import diffrax
+    import optimistix
 
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, _: rate(flow, problem, t, y)),
-        diffrax.Kvaerno5(),
-        t0=times[0],
-        t1=times[-1],
-        dt0=None,
-        y0=state,
-        saveat=diffrax.SaveAt(ts=times[1:]),
-        stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-8),
-        max_steps=100_000,
-        throw=False,
-    )
-    return solution.ys, solution.result == diffrax.RESULTS.successful
+    def solver(numbers: int) -> diffrax.AbstractSolver:
+        if numbers > MOST_IMPLICIT:
+            return diffrax.Tsit5()
+        # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
+        return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
+
+    def advance(flow: Flow, problem: Problem, state: State, times: Array) -> tuple[State, Array]:
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, _: rate(flow, problem, t, y)),
+            solver(state.x.size + state.z.size),
+            t0=times[0],
+            t1=times[-1],
+            dt0=None,
+            y0=state,
+            saveat=diffrax.SaveAt(ts=times[1:]),
+            stepsize_controller=diffrax.PIDController(rtol=1e-7, atol=1e-9, dtmin=1e-12, force_dtmin=False),
+            max_steps=MOST_STEPS,
+            throw=False,
+        )
+        return solution.ys, solution.result == diffrax.RESULTS.successful
+
+    # halves the compilation and costs nothing measurable at run time
+    options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
+    return jax.jit(advance, static_argnames=("flow",), compiler_options=options)
 
 
 @functools.partial(jax.jit, static_argnames=("flow",))
@@ -168,7 +184,7 @@ def simulate_flow(
             for begin in range(0, len(grid) - 1, CHUNK):
                 times = grid[begin : begin + CHUNK + 1]
                 padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
-                states, fine = _advance(flow, recorder.problem, state, jnp.asarray(padded))
+                states, fine = _advance()(flow, recorder.problem, state, jnp.asarray(padded))
                 states = jax.tree.map(lambda leaf, kept=len(times) - 1: leaf[:kept], states)
                 recorder.look(times[1:], states)
                 state = jax.tree.map(lambda leaf: leaf[-1], states)

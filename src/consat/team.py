@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias, cast
 
 import jax
 import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
-from consat.errors import Fault, InvalidTeam
+from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter
+from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
 from consat.numerics import float64
 
 LARGEST = 1e100
 """Numbers beyond this are refused: their squares must stay finite in float64."""
 
+SUGGESTIONS = 20
+"""Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
+
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
 Path = tuple[str | int, ...]
-Links = str | nx.Graph | Iterable[tuple[str, str]]
+Links: TypeAlias = str | nx.Graph | Iterable[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class Family:
         number: (M,) place in the team's order of constraints, which is by owner.
         parameters: arrays with leading axis M.
         weight: (M,) positive factors on ψ.
+        sources: (M,) the texts, if they were written as text expressions, else None.
     """
 
     kind: str
@@ -64,6 +67,7 @@ class Family:
     number: np.ndarray
     parameters: Mapping[str, np.ndarray]
     weight: np.ndarray
+    sources: Sequence[str] | None = None
 
     @property
     def size(self) -> int:
@@ -130,7 +134,7 @@ class Team:
         self.owner = np.array([entry.owner for entry in entries], dtype=np.int32)
         self.names = tuple(entry.name for entry in entries)
         self.families = _families(entries)
-        self.links = _unique(pairs if pairs is not None else _topology(cast(str, links), len(agents), self.families))
+        self.links = _unique(pairs) if pairs is not None else topology(cast(str, links), len(agents), self.families)
 
     @property
     def count(self) -> int:
@@ -172,7 +176,8 @@ def _index(agents: Sequence[Agent], faults: list[Fault]) -> dict[str, int]:
         if not isinstance(agent.id, str) or not agent.id.strip() or not agent.id.isprintable():
             faults.append(Fault(path, f"id is {agent.id!r}, but must be a printable text such as 'a1'", f"agents[{i}]"))
         elif agent.id in index:
-            faults.append(Fault(path, f"id {agent.id!r} is taken by agents[{index[agent.id]}]; every agent needs an id of its own", f"agents[{i}]"))
+            message = f"id {agent.id!r} is taken by agents[{index[agent.id]}]; every agent needs an id of its own"
+            faults.append(Fault(path, message, f"agents[{i}]"))
         else:
             index[agent.id] = i
     return index
@@ -198,7 +203,7 @@ def _entries(agents: Sequence[Agent], index: Mapping[str, int], dimension: int, 
                         entry.values[key] = value
                 weight = _parameter(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
                 entry.weight = 1.0 if weight is None else float(weight)
-                if len(faults) == named:
+                if len(faults) == named and reads:
                     yield entry
 
 
@@ -218,27 +223,35 @@ def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str,
         elif constraint.name in taken:
             message = f"name {constraint.name!r} is taken by another constraint of agent {owner!r}; choose another"
             faults.append(Fault((*path, "name"), message, f"agent {owner!r}"))
-        taken[constraint.name] = 1
+        else:
+            taken[constraint.name] = 1
         return str(constraint.name)
-    others = [agent for agent in constraint.reads if agent not in (OWNER, owner)]
+    others = [str(agent) for agent in constraint.reads if not isinstance(agent, str) or agent not in (OWNER, owner)]
     base = f"{constraint.kind}({', '.join(others)})" if others else constraint.kind
-    taken[base] = taken.get(base, 0) + 1
-    return base if taken[base] == 1 else f"{base} #{taken[base]}"
+    name = base
+    while name in taken:
+        taken[base] += 1
+        name = f"{base} #{taken[base]}"
+    taken[name] = 1
+    return name
 
 
 def _reads(constraint: Constraint, owner: str, index: Mapping[str, int], path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
-    reads = tuple(owner if agent == OWNER else agent for agent in constraint.reads)
     key: Path = ("psi",) if constraint.source is not None else ("agent",)
-    for agent in reads:
-        if agent not in index:
-            faults.append(Fault((*path, *key), f"there is no agent {agent!r}{_closest(agent, index)}", where))
+    reads: list[str] = []
+    for agent in constraint.reads:
+        if isinstance(agent, str) and (agent == OWNER or agent in index):
+            reads.append(owner if agent == OWNER else agent)
+        else:
+            faults.append(Fault((*path, *key), _unknown(agent, index, faults), where))
+    if not isinstance(owner, str) or owner not in index:
+        return ()  # a fault of the owner's id
     if owner not in reads:
         faults.append(Fault((*path, *key), f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", where))
-    if len(set(reads)) < len(reads):
-        repeated = next(agent for agent in reads if reads.count(agent) > 1)
+    if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
         itself = "its own owner" if repeated == owner else "the same agent twice"
         faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
-    return tuple(index.get(agent, -1) for agent in reads)
+    return tuple(index[agent] for agent in reads)
 
 
 def _parameter(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
@@ -254,10 +267,14 @@ def _parameter(parameter: Parameter, dimension: int, path: Path, key: str, where
     if value is not None and parameter.nonzero and not np.any(value):
         faults.append(Fault(path, f"{key} is zero, but must point somewhere", where))
     if value is not None and parameter.above is not None:
-        low = _vector(parameter.above, dimension, path, key, where, [])
+        low = _vector(parameter.above, dimension, (*path[:-1], "low"), "low", where, faults)
         if low is not None and not np.all(value > low):
             faults.append(Fault(path, f"{key} is {value.tolist()}, but must be above low {low.tolist()} on every axis", where))
     return value
+
+
+def _limit(value: Any) -> str:
+    return f" of size at most {LARGEST:g}" if _is_number(value) and abs(value) > LARGEST else ""
 
 
 def _is_number(value: Any) -> bool:
@@ -270,7 +287,7 @@ def _number(parameter: Number, path: Path, key: str, where: str, faults: list[Fa
     if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
         value = value.item()
     if not _is_number(value) or not math.isfinite(value) or abs(value) > LARGEST:
-        faults.append(Fault(path, f"{key} is {_shown(value)}, but must be {want} (at most {LARGEST:g})", where))
+        faults.append(Fault(path, f"{key} is {shown(value)}, but must be {want}{_limit(value)}", where))
         return None
     if parameter.positive and value < 1 / LARGEST:
         faults.append(Fault(path, f"{key} is {value!r}, but must be {want}", where))
@@ -282,12 +299,12 @@ def _vector(value: Any, dimension: int, path: Path, key: str, where: str, faults
     entries = value.tolist() if isinstance(value, np.ndarray | jax.Array) else value
     numbers = f"{dimension} number" + ("s" if dimension > 1 else "")
     if not isinstance(entries, list | tuple):
-        faults.append(Fault(path, f"{key} is {_shown(value)}, but must be a list of {numbers}", where))
+        faults.append(Fault(path, f"{key} is {shown(value)}, but must be a list of {numbers}", where))
     elif dimension and len(entries) != dimension:
         message = f"{key} has {len(entries)} entries, but must have {dimension}, one for each dimension of the team"
         faults.append(Fault(path, message, where))
     elif bad := [entry for entry in entries if not _is_number(entry) or not math.isfinite(entry) or abs(entry) > LARGEST]:
-        faults.append(Fault(path, f"{key} holds {_shown(bad[0])}, but must be a list of {numbers} (at most {LARGEST:g})", where))
+        faults.append(Fault(path, f"{key} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}", where))
     else:
         return np.array(entries, dtype=float)
     return None
@@ -296,28 +313,41 @@ def _vector(value: Any, dimension: int, path: Path, key: str, where: str, faults
 @float64
 def _trace(entries: Iterable[_Entry], dimension: int, faults: list[Fault]) -> None:
     """Trace ψ once a family: whatever a user's function does wrong shows here, before anything runs."""
-    seen: dict[tuple[Any, ...], str | None] = {}
+    seen: dict[tuple[Any, ...], Fault | None] = {}
     for entry in entries:
-        if entry.family not in seen:
-            seen[entry.family] = _untraceable(entry, dimension)
-        if (message := seen[entry.family]) is not None:
-            key: Path = ("psi",) if entry.constraint.source is not None else ()
-            faults.append(Fault((*entry.path, *key), message, entry.where))
+        first = entry.family not in seen
+        fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
+        if fault is not None and not first:
+            written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
+            # Equal expressions may be written differently: each has its own columns.
+            again = _untraceable(entry, dimension) if written else None
+            fault = again or replace(fault, path=(*entry.path, *fault.path[len(entry.path) :]), where=entry.where, offset=0)
+        if fault is not None:
+            faults.append(fault)
 
 
-def _untraceable(entry: _Entry, dimension: int) -> str | None:
+def _untraceable(entry: _Entry, dimension: int) -> Fault | None:
+    message, offset = _mistake(entry, dimension)
+    key: Path = ("psi",) if entry.constraint.source is not None else ()
+    return Fault((*entry.path, *key), message, entry.where, offset) if message else None
+
+
+def _mistake(entry: _Entry, dimension: int) -> tuple[str, int]:
+    """What is wrong with ψ, and where in its text; an empty message if nothing is."""
     position = jax.ShapeDtypeStruct((dimension,), np.dtype(float))
     try:
         shape = jax.eval_shape(functools.partial(entry.constraint.psi, **entry.values), *(position,) * len(entry.agents))
+    except InvalidExpression as error:
+        return error.message, error.column
     except Exception as error:  # whatever the user's own function raises is a fault of the input
         reason = str(error).strip().split("\n")[0]
-        return f"ψ cannot be traced by JAX in dimension {dimension}: {reason or type(error).__name__}"
+        return f"ψ cannot be traced by JAX in dimension {dimension}: {reason or type(error).__name__}", 0
     leaves = jax.tree.leaves(shape)
     if len(leaves) != 1 or leaves[0].shape != ():
-        return f"ψ must return one number, but returns {', '.join(f'shape {leaf.shape}' for leaf in leaves) or 'nothing'}"
+        return f"ψ must return one number, but returns {', '.join(f'shape {leaf.shape}' for leaf in leaves) or 'nothing'}", 0
     if not np.issubdtype(leaves[0].dtype, np.floating):
-        return f"ψ must return a real number, but returns {leaves[0].dtype}; constraints must be differentiable"
-    return None
+        return f"ψ must return a real number, but returns {leaves[0].dtype}; constraints must be differentiable", 0
+    return "", 0
 
 
 def _families(entries: Sequence[_Entry]) -> tuple[Family, ...]:
@@ -336,9 +366,15 @@ def _families(entries: Sequence[_Entry]) -> tuple[Family, ...]:
                 number=np.array(numbers, dtype=np.int32),
                 parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
                 weight=np.array([entry.weight for entry in group]),
+                sources=_sources(group),
             )
         )
     return tuple(families)
+
+
+def _sources(entries: Sequence[_Entry]) -> tuple[str, ...] | None:
+    texts = tuple(entry.constraint.source for entry in entries if entry.constraint.source is not None)
+    return texts if len(texts) == len(entries) else None
 
 
 def _pairs(links: Links, index: Mapping[str, int], faults: list[Fault]) -> np.ndarray | None:
@@ -354,14 +390,19 @@ def _pairs(links: Links, index: Mapping[str, int], faults: list[Fault]) -> np.nd
         ends = tuple(link) if isinstance(link, list | tuple) else (link,)
         where = f"communication link {k + 1}"
         if len(ends) != 2:
-            faults.append(Fault(path, f"a link joins two agents, such as [a1, a2], but is {_shown(link)}", where))
-        elif unknown := [end for end in ends if end not in index]:
-            faults.append(Fault(path, f"there is no agent {unknown[0]!r}{_closest(unknown[0], index)}", where))
+            faults.append(Fault(path, f"a link joins two agents, such as [a1, a2], but is {shown(link)}", where))
+        elif unknown := [end for end in ends if not isinstance(end, str) or end not in index]:
+            faults.append(Fault(path, _unknown(unknown[0], index, faults), where))
         elif ends[0] == ends[1]:
             faults.append(Fault(path, f"agent {ends[0]!r} is linked to itself; name another agent", where))
         else:
             pairs.append((index[ends[0]], index[ends[1]]))
     return np.array(pairs, dtype=np.int32).reshape(-1, 2)
+
+
+def topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
+    """The links of one of `TOPOLOGIES`, (L, 2) int32, i < j, each once."""
+    return _unique(_topology(kind, count, families))
 
 
 def _topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
@@ -383,18 +424,13 @@ def _unique(pairs: np.ndarray) -> np.ndarray:
     return np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0)
 
 
-def _closest(name: Any, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+def _unknown(agent: Any, index: Mapping[str, int], faults: Sequence[Fault]) -> str:
+    hint = closest(agent, index) if len(faults) < SUGGESTIONS else ""
+    return f"there is no agent {shown(agent)}{hint}"
 
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(map(repr, names)) or "nothing"
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "…"
 
 
 def _sortable(part: str | int) -> tuple[int, int, str]:

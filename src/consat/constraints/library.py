@@ -14,7 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from consat.constraints.expression import Expression
-from consat.constraints.record import OWNER, Constraint, Fixed, Number, Vector
+from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
 
 
 def _within(x: Array, *, center: Array, radius: Array) -> Array:
@@ -95,7 +95,7 @@ def displacement(agent: str, vector: ArrayLike, radius: float, *, name: str | No
         name: what reports call it.
         weight: positive factor on ψ.
     """
-    parameters = {"vector": Vector(vector), "radius": Number(radius, positive=True)}
+    parameters: dict[str, Parameter] = {"vector": Vector(vector), "radius": Number(radius, positive=True)}
     return Constraint("displacement", _displacement, (OWNER, agent), parameters, name, weight)
 
 
@@ -132,8 +132,9 @@ def box(low: ArrayLike, high: ArrayLike, *, name: str | None = None, weight: flo
         name: what reports call it; each side gets a suffix such as ``.low[0]``.
         weight: positive factor on every ψ.
     """
-    label = name or "box"
-    axes = np.eye(np.size(low))
+    label = "box" if name is None else name
+    size = len(low) if isinstance(low, list | tuple) else np.size(low)
+    axes = np.eye(min(max(size, 1), 64))  # a size that is not the team's dimension is for the team to refuse
     lows = [
         Constraint("box", _above, (OWNER,), {"low": Vector(low), "axis": Fixed(axis)}, f"{label}.low[{k}]", weight)
         for k, axis in enumerate(axes)

@@ -23,7 +23,7 @@ class Vector:
     """A parameter in R^d; `consat.Team` checks it against its dimension.
 
     Attributes:
-        above: if given, every entry must exceed the entry of this vector.
+        above: if given, every entry must exceed the entry of this vector, which is the parameter ``low``.
     """
 
     value: Any
@@ -65,4 +65,3 @@ class Constraint:
     name: str | None = None
     weight: float = 1.0
     source: str | None = None
-

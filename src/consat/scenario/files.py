@@ -1,0 +1,114 @@
+"""Scenarios from files, from text, and from the package."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from consat.errors import Fault, InvalidInput, InvalidScenario, closest
+from consat.scenario.document import LARGEST, Document, decode, locate, read
+from consat.scenario.overrides import override
+from consat.scenario.schema import build
+from consat.scenario.writing import write
+from consat.settings import Settings
+from consat.team import Team
+
+_PACKAGE = resources.files("consat.scenario")
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A team and how it is run.
+
+    Attributes:
+        name: for reports.
+        team: the agents, their constraints and links.
+        settings: start, protocol, smoothing.
+        text: YAML that gives this scenario, overrides included; empty if no text can (own callables).
+        source: the file or packaged name it was read from.
+        document: where everything stands in it, if it was read.
+    """
+
+    name: str
+    team: Team
+    settings: Settings
+    text: str = field(repr=False)
+    source: str
+    document: Document | None = field(default=None, repr=False)
+
+
+def load(source: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario.
+
+    Args:
+        source: the path of a file, or a packaged name such as ``case-b``; a path that exists wins.
+        overrides: ``path=value`` strings, e.g. ``start.box=[-9, 9]`` or ``agents.a1.constraints.0.radius=2``.
+
+    Raises:
+        InvalidScenario: names every fault with its line and column.
+    """
+    file = os.fspath(source)
+    text = packaged_text(file) if file in packaged() and not Path(file).exists() else _text(file)
+    return loads(text, file, overrides)
+
+
+def loads(text: str, name: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario from text.
+
+    Args:
+        text: the YAML.
+        name: what messages call the file; the scenario's own name if the text gives none.
+        overrides: as for `load`.
+
+    Raises:
+        InvalidScenario: names every fault with its line and column.
+    """
+    document = read(text, name)
+    for each in overrides:
+        override(document, each)
+    team, settings, own = build(document)
+    if overrides and document.root is not None:
+        text = f"# {name!r} with {' '.join(f'--set {each!r}' for each in overrides)}\n{write(document.root.plain)}"
+    return Scenario(own or Path(name).stem, team, settings, text, name, document)
+
+
+def located(error: InvalidInput, scenario: Scenario) -> InvalidScenario:
+    """An error that arose after loading, such as a cluster without links, with the places of its faults in the scenario's file."""
+    return locate(error, scenario.document) if scenario.document else InvalidScenario(error.faults)
+
+
+@functools.cache
+def packaged() -> tuple[str, ...]:
+    """The names of the packaged scenarios."""
+    files = (file.name for file in (_PACKAGE / "packaged").iterdir())
+    return tuple(sorted(name.removesuffix(".yaml") for name in files if name.endswith(".yaml")))
+
+
+def packaged_text(name: str) -> str:
+    """The YAML of a packaged scenario."""
+    return (_PACKAGE / "packaged" / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def template() -> str:
+    """A starting scenario, with comments."""
+    return (_PACKAGE / "template.yaml").read_text(encoding="utf-8")
+
+
+def _text(file: str) -> str:
+    try:
+        with Path(file).open("rb") as stream:
+            content = stream.read(LARGEST + 1)
+    except FileNotFoundError:
+        hint = closest(Path(file).stem, packaged())
+        message = f"there is no such file or packaged scenario; consat init writes a scenario to begin with{hint}"
+    except IsADirectoryError:
+        message = "this is a directory, but must be a scenario file"
+    except (OSError, ValueError) as error:  # the latter: a null character in the name
+        message = f"cannot be read: {getattr(error, 'strerror', None) or error}"
+    else:
+        return decode(content, file)
+    raise InvalidScenario([Fault((), message, file)])

@@ -1,0 +1,190 @@
+"""Plain data as a team and its settings. What a value may be is known to `consat.team` and `consat.settings`; here stand the keys."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from consat.constraints import KINDS
+from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.scenario.document import Document, Path
+from consat.scenario.words import complaints, unknown_key
+from consat.settings import Settings
+from consat.team import Agent, Links, Team
+
+VERSION: Final = 1
+SETTINGS: Final = ("start", "protocol", "smoothing")
+KEYS: Final = ("consat", "name", "dimension", "agents", "communication", *SETTINGS)
+AGENT_KEYS: Final = ("id", "start", "constraints")
+COMMUNICATION_KEYS: Final = ("links", "graph")
+
+
+class _Faults:
+    """Collects; of two faults at one place, or one within the other's, the first is kept: the rest would be its consequence."""
+
+    def __init__(self, known: Iterable[Fault]) -> None:
+        self.found: list[Fault] = []
+        self.paths = {fault.path for fault in known if fault.path}
+
+    def add(self, path: Path, message: str, where: str = "", offset: int = 0) -> None:
+        self.take([Fault(path, message, where, offset)])
+
+    def take(self, faults: Iterable[Fault]) -> None:
+        fresh = [fault for fault in faults if not any(fault.path[: n + 1] in self.paths for n in range(len(fault.path)))]
+        self.found += fresh
+        self.paths |= {fault.path for fault in fresh}
+
+    def keys(self, path: Path, data: Mapping[str, Any], allowed: Sequence[str], where: str = "") -> dict[str, Any]:
+        """What is given: a key without a value (null) is not."""
+        self.take([unknown_key((*path, key), allowed, where) for key in data if key not in allowed])
+        return {key: data[key] for key in data if key in allowed and data[key] is not None}
+
+
+def build(document: Document) -> tuple[Team, Settings, str | None]:
+    """The team, its settings, and the name if there is one.
+
+    Raises:
+        InvalidScenario: with all faults and their places.
+    """
+    data = document.root.plain if document.root else None
+    if not isinstance(data, dict):
+        what = "the file is empty" if data is None else f"the file holds {shown(data)}"
+        message = f"{what}, but must hold keys and values, beginning with consat: {VERSION}; for an example: consat init"
+        raise document.invalid([Fault((), message)])
+    faults = _Faults(document.faults)
+    _version(data, faults, document)
+    data = faults.keys((), data, KEYS)
+    name = data.get("name")
+    if name is not None and not (isinstance(name, str) and name.strip() and name.isprintable()):
+        faults.add(("name",), f"name is {shown(name)}, but must be a printable text; put numbers in quotes")
+    dimension = data.get("dimension", 2)
+    settings = _settings({key: data[key] for key in SETTINGS if key in data}, dimension, faults)
+    agents = _agents(data.get("agents"), faults)
+    links = _links(data.get("communication"), faults)
+    team = None
+    try:
+        team = Team(agents, links, dimension)
+    except InvalidTeam as error:
+        faults.take(error.faults)
+    if faults.found or document.faults or team is None:
+        raise document.invalid(faults.found)
+    return team, settings, name
+
+
+def _version(data: Mapping[str, Any], faults: _Faults, document: Document) -> None:
+    version = data.get("consat")
+    if isinstance(version, int) and version > VERSION:
+        message = f"the scenario is of version {shown(version)}, but this consat reads version {VERSION}; upgrade consat"
+        raise document.invalid([Fault(("consat",), message)])
+    if version is None:
+        faults.add(("consat",), f"the version is missing; a scenario begins with the line consat: {VERSION}")
+    elif type(version) is not int or version != VERSION:
+        faults.add(("consat",), f"the version is {shown(version)}, but must be {VERSION}")
+
+
+def _settings(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Settings:
+    try:
+        settings = Settings.model_validate(data, by_alias=True, by_name=False)
+    except ValidationError as error:
+        faults.take(complaints(error, data))
+        return Settings()
+    for side in settings.start.box or ():
+        if isinstance(side, tuple) and isinstance(dimension, int) and len(side) != dimension:
+            message = f"a side of the box has {len(side)} entries, but must have {dimension}, one for each dimension of the team"
+            faults.add(("start", "box"), message, "start")
+    return settings
+
+
+def _links(data: Any, faults: _Faults) -> Links:
+    path: Path = ("communication",)
+    example = "{links: [[a1, a2]]} or {graph: ring}"
+    if data is None:
+        return "task"
+    if not isinstance(data, dict):
+        faults.add(path, f"communication is {shown(data)}, but must be a mapping such as {example}")
+        return "task"
+    data = faults.keys(path, data, COMMUNICATION_KEYS)
+    links, graph = data.get("links"), data.get("graph")
+    if (links is None) == (graph is None):
+        what = "neither links nor a graph" if links is None else "both links and a graph"
+        faults.add(path, f"communication has {what}, but must have one of them, such as {example}")
+    if links is None:
+        if graph is not None and not isinstance(graph, str):
+            faults.add((*path, "graph"), f"graph is {shown(graph)}, but must be a word such as ring")
+        return graph if isinstance(graph, str) else "task"
+    if not isinstance(links, list):
+        faults.add((*path, "links"), f"links is {shown(links)}, but must be a list of pairs such as [[a1, a2], [a2, a3]]")
+        return "task"
+    return links
+
+
+def _agents(data: Any, faults: _Faults) -> list[Agent]:
+    """The agents one by one; whatever stands for many agents at once will join them here."""
+    if data is None:
+        faults.add(("agents",), "agents is missing; it must be a list such as [{id: a1, constraints: [..]}]")
+    elif not isinstance(data, list):
+        faults.add(("agents",), f"agents is {shown(data)}, but must be a list such as [{{id: a1, constraints: [..]}}]")
+    else:
+        return [_agent(entry, ("agents", i), faults) for i, entry in enumerate(data)]
+    return []
+
+
+def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
+    where = f"agents[{path[-1]}]"
+    if not isinstance(data, dict):
+        faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{id: a1, constraints: [..]}}", where)
+        return Agent(data if isinstance(data, str) else where)
+    data = faults.keys(path, data, AGENT_KEYS, where)
+    if "id" not in data:
+        faults.add((*path, "id"), "id is missing; every agent needs one, such as a1", where)
+    name = data.get("id", where)
+    constraints = data.get("constraints", [])
+    if not isinstance(constraints, list):
+        faults.add((*path, "constraints"), f"constraints is {shown(constraints)}, but must be a list of mappings", f"agent {name!r}")
+        constraints = []
+    made = [_constraint(item, (*path, "constraints", k), name, faults) for k, item in enumerate(constraints)]
+    return Agent(name, made, data.get("start"))
+
+
+def _constraint(data: Any, path: Path, owner: Any, faults: _Faults) -> Any:
+    """The constraint, or constraints; an empty list if the faults leave nothing to check."""
+    where = f"agent {owner!r}, constraint {int(path[-1]) + 1}"
+    if not isinstance(data, dict):
+        faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{kind: within, center: [2, 0], radius: 1}}", where)
+        return []
+    kind = data.get("kind")
+    if kind is None:
+        faults.add((*path, "kind"), f"kind is missing; it is one of {', '.join(KINDS)}", where)
+        return []
+    if not isinstance(kind, str) or kind not in KINDS:
+        faults.add((*path, "kind"), f"there is no kind {shown(kind)}; the kinds are {', '.join(KINDS)}{closest(kind, KINDS)}", where)
+        return []
+    name = data.get("name")
+    where = f"agent {owner!r}, constraint {name if isinstance(name, str) else kind!r}"
+    keys = _keys(kind)
+    data = faults.keys(path, data, ("kind", *keys), where)
+    needed = [key for key, parameter in keys.items() if parameter.default is parameter.empty]
+    # What is needed and missing gets a stand-in. The team's complaint about it is dropped: its place has a fault already.
+    given: dict[str, Any] = dict.fromkeys(needed, "")
+    for key, parameter in keys.items():
+        if key in data and "str" in str(parameter.annotation) and not isinstance(data[key], str):
+            faults.add((*path, key), f"{key} is {shown(data[key])}, but must be text; put numbers in quotes", where)
+        elif key in data:
+            given[key] = data[key]
+        elif key in needed:
+            faults.add((*path, key), f"{key} is missing; {kind} needs {', '.join(needed)}", where)
+    try:
+        return KINDS[kind](**given)
+    except InvalidExpression as error:
+        faults.add((*path, "psi"), error.message, where, error.column)
+        return []
+
+
+@functools.cache
+def _keys(kind: str) -> Mapping[str, inspect.Parameter]:
+    """The arguments of the factory."""
+    return inspect.signature(KINDS[kind]).parameters
