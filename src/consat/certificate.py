@@ -1,6 +1,6 @@
 """What is proven of a team: bounds on the best margin any formation can have, and the verdict that follows.
 
-Let ψ_k be concave, λ ≥ 0 with Σ λ = 1 and L = β̄(x̂). Any formation x that is better than x̂ has β̄(x) ≤ Σ λ_k ψ_k(x), and, as this sum is concave,
+Let ψ_k be concave, λ ≥ 0 with Σ λ = 1. A formation x that is better than x̂ has β̄(x) ≤ Σ λ_k ψ_k(x), and, as this sum is concave,
 
     β̄(x) ≤ q(z) + ∇q(z)·(x − z) ≤ q(z) + Σ_i ‖∇_i q(z)‖ (R_i + ‖z_i − x̂_i‖),    q = Σ λ_k ψ_k,
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -32,6 +33,8 @@ Verdict = Literal["feasible", "infeasible", "undecided"]
 
 RUNGS = 4.0 ** np.arange(0, 7)
 """ν times the scale of ψ: from weights that see every constraint to those that see only the worst."""
+LARGE = 200_000
+"""Beyond so many coordinates only every third rung is tried."""
 BLEND = 1e-3
 """How much of the softest weights every other rung keeps: underflowed weights leave agents without curvature."""
 REFINEMENT = 4.0 ** np.arange(0, 8)
@@ -40,8 +43,9 @@ CLIMB = 12
 """Newton steps at each ν of the refinement, at most."""
 DENSE = 60
 """Up to so many coordinates a dense factorisation is the quicker one."""
-ROUNDING = 64 * np.finfo(float).eps
-"""Allowance for the roundings of a sum, relative to the sum of its terms' sizes."""
+EPS = float(np.finfo(float).eps)
+ROUNDINGS = 64
+"""Allowance for the roundings within a term of a sum, in units of `EPS` and of the sizes that went into it; the sum adds one a term."""
 BINDING = 1e-3
 """A multiplier below this does not count as binding."""
 
@@ -56,6 +60,7 @@ class Certificate:
         multipliers: (M,) λ that prove `upper`; they sum to 1 within every cluster that has concave constraints.
         verdict: ``feasible`` if the formation in hand satisfies all, ``infeasible`` if `upper` ≤ 0, else ``undecided``.
         binding: places of the constraints that λ rests on, the heaviest first.
+        clusters: (C, 2) lower and upper bound of every cluster, +∞ where there are no constraints or nothing is proven.
     """
 
     lower: float
@@ -63,12 +68,11 @@ class Certificate:
     multipliers: Floats
     verdict: Verdict
     binding: Ints
+    clusters: Floats
 
 
 @float64
-def bounds(
-    team: Team, positions: Floats, nu: Nu | None = None, refine: bool = True, multipliers: Floats | None = None
-) -> Certificate:
+def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = True, multipliers: Floats | None = None) -> Certificate:
     """Certify a formation.
 
     Args:
@@ -80,11 +84,11 @@ def bounds(
     """
     x = np.asarray(positions, dtype=float)
     if not len(team.owner):
-        return Certificate(np.inf, None, np.zeros(0), "feasible", np.zeros(0, dtype=np.intp))
+        return Certificate(np.inf, None, np.zeros(0), "feasible", np.zeros(0, dtype=np.intp), np.full((team.count, 2), np.inf))
     with np.errstate(over="ignore", invalid="ignore"):
         model = expand(team, x) if np.isfinite(x).all() else None
         if model is None or not np.isfinite(model.value).all():
-            return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp))
+            return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
         proof = _Proof(team, model)
         proof.ladder(nu, multipliers)
         if refine:
@@ -92,9 +96,9 @@ def bounds(
     lower, upper = float(model.value.min()), float(proof.upper.min())
     verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper <= 0 else "undecided"
     heavy = np.flatnonzero(proof.best > BINDING)
-    return Certificate(
-        lower, upper if np.isfinite(upper) else None, proof.best, verdict, heavy[np.argsort(-proof.best[heavy], kind="stable")]
-    )
+    order = heavy[np.argsort(-proof.best[heavy], kind="stable")]
+    each = np.stack([proof.margins, proof.upper], axis=1)
+    return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, verdict, order, each)
 
 
 class _Proof:
@@ -114,6 +118,11 @@ class _Proof:
         if not self.exact:
             known, lower = with_tangents(team, known, lower, self.concave & ~shape.quadratic, float(unit.length.max()))
         self.radius = radii(known, lower, self.cluster)
+        self.rounding = EPS * (ROUNDINGS + np.bincount(self.group, minlength=self.count))[self.group]
+        degree = np.zeros(team.count)
+        for family in team.families:
+            degree += np.bincount(family.agents.ravel(), minlength=team.count)
+        self.roughness = EPS * (ROUNDINGS + degree)
         self.upper = np.full(self.count, np.inf)
         self.best = np.zeros(len(self.group))
 
@@ -127,9 +136,10 @@ class _Proof:
     def ladder(self, nu: Nu | None, multipliers: Floats | None) -> None:
         """Weights at x̂ itself."""
         soft = self.weights(self.model.value, 1.0 / self.psi)
-        candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in RUNGS]
+        rungs = RUNGS if self.model.size <= LARGE else RUNGS[::3]
+        candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in rungs]
         if nu is not None:
-            own = np.asarray(Objective.at_positions(self.team).multipliers(self.model.at, nu))
+            own = np.asarray(Objective.at_positions(self.team).multipliers(jnp.asarray(self.model.at), nu))
             candidates.append(normalised(np.where(self.concave, own, 0.0), self.group, self.count))
         if multipliers is not None:
             candidates.append(normalised(np.where(self.concave, multipliers, 0.0), self.group, self.count))
@@ -174,7 +184,7 @@ class _Proof:
         for _ in range(30):
             after = expand(self.team, model.at + length[self.cluster][:, None] * step).keep(self.concave)
             value = self.smooth(np.where(np.isfinite(after.value), after.value, -np.inf), nu)
-            short = (length > 0) & ~(value >= before + 0.1 * length * promise - ROUNDING * np.abs(before))
+            short = (length > 0) & ~(value >= before + 0.1 * length * promise - ROUNDINGS * EPS * np.abs(before))
             if not short.any():
                 return after, bool((length > 0).any())
             length = np.where(short, 0.5 * length, length)
@@ -209,9 +219,9 @@ class _Proof:
         values, slope = model.values(step), model.gradient(weights, step)
         away = np.linalg.norm(model.at + step - self.model.at, axis=1)
         size, rough = _sizes(model, step, weights)
-        left = np.linalg.norm(slope, axis=1) + ROUNDING * rough
+        left = np.linalg.norm(slope, axis=1) + self.roughness * rough
         reach = np.where(left > 0, left * np.where(left > 0, self.radius + away, 0.0), 0.0)
-        terms = weights * values + ROUNDING * weights * size
+        terms = weights * (values + self.rounding * size)
         bound = np.bincount(self.group, np.where(weights > 0, terms, 0.0), minlength=self.count)
         bound += np.bincount(self.cluster, reach, minlength=self.count)
         total = np.bincount(self.group, weights, minlength=self.count)
@@ -250,7 +260,7 @@ def _solve(bend: sparse.csc_array, slope: Floats, damping: float) -> Floats:
 
 def _dense(matrix: Floats, slope: Floats) -> Floats:
     try:
-        step: Floats = np.linalg.solve(matrix, slope)
+        step = np.asarray(np.linalg.solve(matrix, slope), dtype=float)
     except np.linalg.LinAlgError:
         return np.zeros_like(slope)
     return np.where(np.isfinite(step), step, 0.0)

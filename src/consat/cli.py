@@ -84,11 +84,17 @@ def init(name: str | None) -> None:
 @cli.command()
 @scenario_argument
 @set_option
-@click.option("--protocol", metavar="KIND", help="gradient-flow, proportional-integral or selfish.")
+@click.option("--protocol", metavar="KIND", help="admm (default), proximal, gradient-flow, proportional-integral, selfish.")
 @click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
+@click.option("--rounds", type=click.IntRange(min=0), help="How many rounds; implies --stop never.")
 @click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End of a flow; implies --stop never.")
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end earlier.")
+@click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
+@click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that an agent skips a round.")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, for bodies that cannot jump.")
+@click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
+@click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there.")
 @click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
@@ -183,7 +189,7 @@ def _cache_compilations() -> None:
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 

@@ -17,9 +17,10 @@ from scipy import sparse
 
 from consat.quadratics import Block, Expansion, Floats, Ints
 
-
 FLAT = 1e-12
 """Eigenvalues below this part of the largest are rounding."""
+STRAIGHT = 1e-6
+"""A curvature below this part of the largest says nothing of the size of ψ."""
 TOLERANCE = 1e-9
 """Clarabel's relative gap and residuals, in units of a cluster's own scale; 1e-8 is its default, 1e-10 is out of reach at times."""
 
@@ -59,7 +60,7 @@ def units(model: Expansion, group: Ints, count: int) -> Units:
     for block in model.blocks:
         norm = np.linalg.norm(block.hessian, axis=(1, 2))
         slope[block.number] = np.linalg.norm(block.gradient, axis=1)
-        lift = np.einsum("mi,mij,mj->m", block.gradient, np.linalg.pinv(block.hessian, hermitian=True), block.gradient)
+        lift = np.einsum("mi,mij,mj->m", block.gradient, np.linalg.pinv(block.hessian, STRAIGHT, hermitian=True), block.gradient)
         top[block.number], bend[block.number] = np.abs(model.value[block.number] - 0.5 * lift), norm
     curved = (bend > 0) & (top > 0)
     radius = np.sqrt(2 * top / np.where(curved, bend, 1.0))
@@ -92,59 +93,61 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
 
     count, dimension = int(cluster.max(initial=-1)) + 1, model.at.shape[1]
     unit = units(model, group, count)
-    read = np.zeros(model.size, dtype=bool)
+    read = np.zeros(model.at.shape, dtype=bool)
     for block in model.blocks:
-        read[block.columns.ravel()] = True
+        read.ravel()[block.columns] = True
+    nothing = np.zeros(model.at.shape), np.zeros(len(group))
     if not read.any():
-        return Solution(np.zeros(model.at.shape), np.zeros(len(group)), "solved")
-    place = np.cumsum(read) - 1
-    active = np.unique(np.concatenate([group[block.number] for block in model.blocks]))
-    rank_of = np.zeros(count, dtype=np.intp)
-    rank_of[active] = np.arange(len(active))
-    length = np.repeat(unit.length[cluster], dimension)
+        return Solution(*nothing, "solved")
+    place, length = np.cumsum(read) - 1, np.repeat(unit.length[cluster], dimension)
+    active, which = np.unique(group, return_inverse=True)
     u, t = cp.Variable(int(read.sum())), cp.Variable(len(active))
-    constraints: list[Any] = []
+    constraints: list[Any] = [] if ceiling is None else [t <= ceiling[active]]
     duals: list[tuple[Ints, Any]] = []
     for block in model.blocks:
         for number, F, b, columns in _by_rank(block):
-            psi = unit.psi[group[number]]
-            per = length[columns] / psi[:, None]
-            slack = _rows(b * per, place[columns], u.size) @ u + model.value[number] / psi - t[rank_of[group[number]]]
-            rank = F.shape[1]
-            if rank == 0:
-                constraints.append(slack >= 0)
-            else:
-                scaled = F * (np.sqrt(2.0) * length[columns] / np.sqrt(psi)[:, None])[:, None, :]
-                flat = _rows(scaled.reshape(-1, F.shape[2]), np.repeat(place[columns], rank, axis=0), u.size) @ u
-                tall = cp.vstack([cp.reshape(flat, (rank, len(number)), order="F"), cp.reshape(slack - 1, (1, len(number)), order="F")])
-                constraints.append(cp.SOC(slack + 1, tall, axis=0))
+            psi = unit.psi[group[number]][:, None]
+            slack = _rows(b * length[columns] / psi, place[columns], u.size) @ u + model.value[number] / psi[:, 0] - t[which[number]]
+            scaled = F * (np.sqrt(2.0) * length[columns] / np.sqrt(psi))[:, None, :]
+            flat = _rows(scaled.reshape(-1, F.shape[2]), np.repeat(place[columns], F.shape[1], axis=0), u.size)
+            constraints.append(_cone(slack, flat @ u if F.shape[1] else None, len(number)))
             duals.append((number, constraints[-1]))
     if trust is not None:
-        held = np.flatnonzero(read.reshape(-1, dimension).any(axis=1) & np.isfinite(trust))
-        kept = read.reshape(-1, dimension)[held]
-        columns = np.where(kept, place.reshape(-1, dimension)[held], 0)
-        pick = _rows(kept.reshape(-1, 1).astype(float), columns.reshape(-1, 1), u.size) @ u
-        radius = trust[held] / unit.length[cluster[held]]
-        constraints.append(cp.SOC(radius, cp.reshape(pick, (dimension, len(held)), order="F"), axis=0))
-    if ceiling is not None:
-        constraints.append(t <= ceiling[active])
-    problem = cp.Problem(cp.Maximize(cp.sum(t)), constraints)
+        held = read.all(axis=1)
+        radius = (trust / unit.length[cluster])[held]
+        constraints.append(cp.SOC(radius, cp.reshape(u, (dimension, len(radius)), order="F"), axis=0))
+    status = _solve(cp.Problem(cp.Maximize(cp.sum(t)), constraints))
+    if status != "solved":
+        return Solution(*nothing, status)
+    step, multipliers = nothing
+    step[read] = u.value * length[read.ravel()]
+    for number, constraint in duals:
+        multipliers[number] = _multiplier(constraint)
+    return Solution(step, normalised(multipliers, group, count), status)
+
+
+def _cone(slack: Any, flat: Any, members: int) -> Any:
+    """w ≥ ½ ‖F y‖² for every member, `flat` being √2 F y member by member, or None where there is no curvature."""
+    import cvxpy as cp
+
+    if flat is None:
+        return slack >= 0
+    tall = cp.vstack([cp.reshape(flat, (flat.size // members, members), order="F"), cp.reshape(slack - 1, (1, members), order="F")])
+    return cp.SOC(slack + 1, tall, axis=0)
+
+
+def _solve(problem: Any) -> str:
+    import cvxpy as cp
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it may be inaccurate: whoever uses the answer evaluates it
             problem.solve(solver=cp.CLARABEL, tol_gap_abs=TOLERANCE, tol_gap_rel=TOLERANCE, tol_feas=TOLERANCE)
     except cp.SolverError:
-        return Solution(np.zeros(model.at.shape), np.zeros(len(group)), "failed")
+        return "failed"
     if problem.status in (cp.UNBOUNDED, cp.UNBOUNDED_INACCURATE):
-        return Solution(np.zeros(model.at.shape), np.zeros(len(group)), "unbounded")
-    if u.value is None:
-        return Solution(np.zeros(model.at.shape), np.zeros(len(group)), "failed")
-    step = np.zeros(model.size)
-    step[read] = u.value * length[read]
-    multipliers = np.zeros(len(group))
-    for number, constraint in duals:
-        multipliers[number] = _multiplier(constraint) / unit.psi[group[number]]
-    return Solution(step.reshape(model.at.shape), normalised(multipliers, group, count), "solved")
+        return "unbounded"
+    return "solved" if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else "failed"
 
 
 def normalised(weights: Floats, group: Ints, count: int) -> Floats:

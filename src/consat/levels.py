@@ -1,7 +1,7 @@
 """How far a better formation can lie: radii that turn a leftover gradient into a bound (design, section 6).
 
-Whoever is better than x̂ satisfies ψ_k ≥ L = β̄(x̂) for every k. Constraints on one agent then keep it in a region of its own; constraints on
-the difference of two keep them within reach of each other; so the radius of every agent is a shortest path from the regions along the reaches.
+Whoever is better than x̂ satisfies ψ_k ≥ L = β̄(x̂) for every k. Constraints on one agent then keep it in a region of its own; constraints
+on the difference of two keep them within reach of each other; so the radius of an agent is a shortest path from the regions along the reaches.
 Affine constraints and supporting planes of concave ones are gathered into polytopes.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import nnls
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from consat.quadratics import Block, Expansion, Floats, Ints, tangents
 from consat.team import Team
@@ -61,9 +61,12 @@ def radii(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
         balanced = _of_differences(block, dimension)
         reaches += _balls(block, slack, balanced, dimension)
         planes += _planes(block, slack, balanced, dimension)
-    reaches.append(_boxes(_joined(planes), reaches, count))
+    walls = _joined(planes)
+    reaches.append(_boxes(walls, reaches, count))
     pair, reach = (np.concatenate(parts) for parts in zip(*reaches, strict=True))
     paths = _paths(pair, reach, count)
+    if np.isinf(paths).any():
+        paths = _together(walls, pair, reach, paths)
     if np.isinf(paths).any() and model.size <= MOST_DENSE:
         paths = np.minimum(paths, _ellipsoid(model, lower, cluster))
     return paths
@@ -78,7 +81,9 @@ def _anchors(model: Expansion, cluster: Ints) -> _Planes:
         n = block.columns.shape[1]
         together = np.tile(np.eye(dimension), (n // dimension, 1))
         rows = np.concatenate([block.gradient[:, None, :] @ together, block.hessian @ together], axis=1)
-        size = np.concatenate([np.abs(block.gradient).max(axis=1)[:, None], np.repeat(np.abs(block.hessian).max(axis=(1, 2))[:, None], n, 1)], 1)
+        size = np.concatenate(
+            [np.abs(block.gradient).max(axis=1)[:, None], np.repeat(np.abs(block.hessian).max(axis=(1, 2))[:, None], n, 1)], 1
+        )
         rows = rows / np.where(size > 0, size, 1.0)[:, :, None]
         np.add.at(notice, cluster[block.columns[:, 0] // dimension], np.swapaxes(rows, 1, 2) @ rows)
         if n == dimension:
@@ -185,6 +190,27 @@ def _boxes(planes: _Planes, reaches: list[_Reaches], count: int) -> _Reaches:
     return _Reaches(np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1)[finite], reach[finite])
 
 
+def _together(walls: _Planes, pair: Ints, reach: Floats, paths: Floats) -> Floats:
+    """Agents within reach of each other share their walls: a wall of one is a wall of another, farther off by the reach between them."""
+    count = len(paths)
+    tied = pair[:, 0] != pair[:, 1]
+    graph = _graph(pair[tied], reach[tied], count)
+    part = connected_components(graph, directed=False)[1]
+    own = walls.pair[:, 0] == walls.pair[:, 1]
+    where, normal, height = walls.pair[own, 0], walls.normal[own], walls.height[own]
+    sizes = np.linalg.norm(normal, axis=1)
+    order = np.argsort(part[where], kind="stable")
+    ends = np.searchsorted(part[where][order], np.arange(part.max() + 2))
+    lost = np.unique(part[np.isinf(paths)])
+    enough = ends[lost + 1] - ends[lost] > normal.shape[1]
+    for p in lost[enough][:MOST_POLYTOPES]:
+        members = order[ends[p] : ends[p + 1]]
+        away = dijkstra(graph, indices=where[members[0]])[:count]
+        radius = _farkas(normal[members], height[members] + sizes[members] * away[where[members]])
+        paths = np.minimum(paths, radius + away)
+    return paths
+
+
 def _farkas(normal: Floats, height: Floats) -> float:
     """A radius of {v: normal v + height ≥ 0} about 0: μ ≥ 0 with Σ μ normal = −e gives e·v ≤ μ·height."""
     sizes = np.linalg.norm(normal, axis=1)
@@ -204,15 +230,19 @@ def _farkas(normal: Floats, height: Floats) -> float:
 def _paths(pair: Ints, reach: Floats, count: int) -> Floats:
     """Shortest paths from a source that is joined to every agent with a region of its own."""
     own = pair[:, 0] == pair[:, 1]
-    tail, head = np.where(own, count, pair[:, 0]), pair[:, 1]
+    distances: Floats = dijkstra(_graph(np.stack([np.where(own, count, pair[:, 0]), pair[:, 1]], axis=1), reach, count + 1), indices=count)
+    return distances[:count]
+
+
+def _graph(pair: Ints, reach: Floats, count: int) -> sparse.csr_array:
+    """The shortest of the reaches between every two, both ways."""
+    tail, head = pair[:, 0], pair[:, 1]
     tail, head, reach = np.concatenate([tail, head]), np.concatenate([head, tail]), np.concatenate([reach, reach])
     order = np.lexsort((reach, head, tail))
     tail, head, reach = tail[order], head[order], np.maximum(reach[order], np.finfo(float).tiny)
     first = np.ones(len(tail), dtype=bool)
     first[1:] = (tail[1:] != tail[:-1]) | (head[1:] != head[:-1])
-    graph = sparse.csr_array((reach[first], (tail[first], head[first])), shape=(count + 1, count + 1))
-    distances: Floats = dijkstra(graph, indices=count)[:count]
-    return distances
+    return sparse.csr_array((reach[first], (tail[first], head[first])), shape=(count, count))
 
 
 def _ellipsoid(model: Expansion, lower: Floats, cluster: Ints) -> Floats:

@@ -31,6 +31,11 @@ def float64(function: Callable[P, T]) -> Callable[P, T]:
     return wrapped
 
 
+def quick_compilation() -> dict[str, bool | int] | None:
+    """Options for programs that take longer to compile than to run: on a CPU they halve the former at no measurable cost to the latter."""
+    return {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Groups:

@@ -9,7 +9,9 @@ coefficients of a team far out (a disc of radius 1 at 1e6) would have lost their
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -161,7 +163,7 @@ class Expansion:
         return sparse.csc_array((_joined(entries, float), where), shape=(self.size, self.size))
 
 
-def _joined(parts: list[NDArray[np.generic]], kind: type) -> NDArray[np.generic]:
+def _joined(parts: Sequence[NDArray[Any]], kind: type) -> NDArray[Any]:
     return np.concatenate([np.zeros(0, dtype=kind), *parts])
 
 

@@ -37,6 +37,8 @@ ROUNDS = 60
 """Cone programs at most in polishing one start."""
 SETTLED = 1e-9
 """Polishing ends when a step promises less than this, in units of ψ; the cone programs resolve no more."""
+AGAIN = 3
+"""Steps of the exact solution at most."""
 FAR = 1e3
 """A step longer than this, in lengths, is taken up again from where it ended: digits were lost."""
 
@@ -113,16 +115,17 @@ def _inverse_bend(model: Expansion) -> Floats:
 
 def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
     group = cluster[team.owner]
-    solution, model = None, expand(team, x)
-    for _ in range(3):
-        solution = maximise(model, cluster, group)
+    model = expand(team, x)
+    solution = maximise(model, cluster, group)
+    for _ in range(AGAIN):
         if solution.status != "solved":
             break
         x = x + solution.step
-        far = np.abs(solution.step).max(initial=0.0) > FAR * units(model, group, int(cluster.max()) + 1).length.min()
+        far = (np.abs(solution.step).max(axis=1) > FAR * units(model, group, int(cluster.max()) + 1).length[cluster]).any()
         model = expand(team, x)
         if not far:
             break
+        solution = maximise(model, cluster, group)
     if solution.status == "unbounded":
         return _limitless(team, cluster, model)
     if solution.status == "failed":

@@ -7,28 +7,35 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
-from consat.errors import InvalidSettings
+from consat.assumptions import with_auxiliary
+from consat.certificate import bounds
+from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
-from consat.objective import Objective, Schedule
-from consat.protocols import FLOWS, Flow
+from consat.objective import Nu, Objective, Schedule
+from consat.protocols import FLOWS, ROUNDS
+from consat.quadratics import shape_of
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
-from consat.errors import InvalidTeam
 from consat.settings import ProtocolSettings, Settings, Smoothing, Start
-from consat.simulate import Stop, simulate_flow
+from consat.simulate import Stop
+from consat.simulate.flows import simulate_flow
+from consat.simulate.rounds import Body, Weather, simulate_rounds
 from consat.team import Team
 from consat.trace import Trace
 
-DEFAULT_PROTOCOL = "gradient-flow"
+DEFAULT_PROTOCOL = "admm"
 SCHEMA = "consat.run/1"
 MOST_LISTED = 10_000
 """Above this many agents the summary leaves out what it says of each."""
+AT_REST = 1e-2
+"""A team whose last positions moved by less than this, in its units of length, counts as arrived."""
 
 
 def run(
@@ -40,7 +47,13 @@ def run(
     start: tuple[Any, Any] | None = None,
     smoothing: Smoothing | Literal["auto"] | None = None,
     until: float | None = None,
+    rounds: int | None = None,
     stop: Stop | None = None,
+    loss: float = 0.0,
+    sleep: float = 0.0,
+    rate: float | None = None,
+    speed: float | None = None,
+    auxiliary: float | None = None,
     record: bool | None = None,
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
@@ -49,13 +62,19 @@ def run(
 
     Args:
         team: a `consat.Team`, or a scenario: the path of a file, or the name of a packaged one such as ``case-b``.
-        protocol: how they talk; one of `consat.protocols.FLOWS`.
+        protocol: how they talk; one of `consat.protocols.ROUNDS` (``admm`` by default) or `consat.protocols.FLOWS`.
         estimates: ``local``: each holds only the positions its constraints need; ``full``: all of its cluster (the paper).
-        seed: of the random starts and first estimates.
+        seed: of the random starts and first estimates, and of what gets lost.
         start: ``(low, high)`` of the box they are drawn from, numbers or (d,) arrays, length.
         smoothing: ν_α and ν_β, or ``auto``.
         until: end of a flow, s; implies ``stop="never"``.
+        rounds: number of rounds; implies ``stop="never"``.
         stop: ``satisfied`` (default), ``converged`` or ``never``.
+        loss: probability that a message is lost, in rounds.
+        sleep: probability that an agent skips a round.
+        rate: rounds a second, Hz, for a body that cannot jump; positions then follow estimates.
+        speed: the most that such a body moves, length/s.
+        auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         record: whether to keep all estimates and integral states; by default while they are few.
         full: whether to list every agent in the summary, however many.
         progress: called with the fraction done and the margin.
@@ -69,6 +88,8 @@ def run(
         InvalidSettings: the settings do not fit together.
     """
     scenario = _scenario(team)
+    if auxiliary is not None:
+        scenario = dataclasses.replace(scenario, team=with_auxiliary(scenario.team, auxiliary))
     asked = scenario.settings
     settings = asked.model_copy(
         update={
@@ -77,30 +98,65 @@ def run(
                 update={"kind": protocol or asked.protocol.kind or DEFAULT_PROTOCOL, "estimates": estimates or asked.protocol.estimates}
             ),
             "smoothing": smoothing or asked.smoothing,
-            "until": until or asked.until,
-            "stop": stop or asked.stop or ("satisfied" if until is None else "never"),
         }
     )
-    return _run(scenario, settings, record, full, progress)
+    kind = settings.protocol.kind
+    if kind not in FLOWS and kind not in ROUNDS:
+        raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
+    stop = stop or ("satisfied" if until is None and rounds is None else "never")
+    if kind in FLOWS:
+        _refuse(kind, "flows in continuous time; give until, or choose a protocol in rounds", rounds=rounds, loss=loss, sleep=sleep, rate=rate)
+        return _run(scenario, settings, full, lambda *given: _flow(*given, settings, until, stop, record, progress))
+    _refuse(kind, "goes in rounds; give rounds, or choose a flow", until=until)
+    if (speed is not None and rate is None) or (speed is not None and not speed > 0) or (rate is not None and not rate > 0):
+        raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
+    if not (0 <= loss < 1 and 0 <= sleep < 1):
+        raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
+    weather = Weather(loss, sleep, settings.start.seed)
+    body = None if rate is None else Body(rate, np.inf if speed is None else speed)
+    return _run(scenario, settings, full, lambda *given: _rounds(*given, settings, rounds, stop, weather, body, record, progress))
+
+
+def _refuse(kind: str | None, why: str, **given: float | None) -> None:
+    if wrong := [name for name, value in given.items() if value]:
+        raise InvalidSettings(f"protocol {kind} {why}; {', '.join(wrong)} has no meaning for it")
 
 
 @float64
-def _run(scenario: Scenario, settings: Settings, record: bool | None, full: bool, progress: Callable[[float, float], None]) -> Result:
+def _run(scenario: Scenario, settings: Settings, full: bool, simulate: Callable[[Team, Estimates, Schedule, Scale, np.ndarray], Trace]) -> Result:
     team = scenario.team
-    flow = _flow(settings.protocol)
     copies = Estimates.of(team, settings.protocol.estimates)
-    size = scale(team) if settings.smoothing == "auto" or settings.start.box is None else None
-    smoothing = automatic(size) if settings.smoothing == "auto" and size else settings.smoothing
-    assert isinstance(smoothing, Smoothing)
+    size = scale(team)
+    smoothing = automatic(size) if settings.smoothing == "auto" else settings.smoothing
     schedule = Schedule.of(smoothing)
-    trace = simulate_flow(
-        team, flow, copies, schedule, first_estimates(team, copies, settings.start, size),
-        until=settings.until, stop=settings.stop or "satisfied", record=record, progress=progress,
+    trace = simulate(team, copies, schedule, size, first_estimates(team, copies, settings.start, size))
+    return Result(summarise(scenario, settings, schedule, size, trace, full), trace=trace, team=team, scenario=scenario.text)
+
+
+def _flow(
+    team: Team, copies: Estimates, schedule: Schedule, _: Scale, first: np.ndarray, settings: Settings, until: float | None, stop: Stop,
+    record: bool | None, progress: Callable[[float, float], None],
+) -> Trace:  # fmt: skip
+    flow = _with_gains(FLOWS[settings.protocol.kind or ""](), settings.protocol)
+    return simulate_flow(
+        team, flow, copies, schedule, first, until=until, stop=stop, record=record, progress=progress,
+        infeasible=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
     )  # fmt: skip
-    return Result(summarise(scenario, settings, schedule, trace, full), trace=trace, team=team, scenario=scenario.text)
 
 
-def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale | None) -> np.ndarray:
+def _rounds(
+    team: Team, copies: Estimates, schedule: Schedule, size: Scale, first: np.ndarray, settings: Settings, rounds: int | None, stop: Stop,
+    weather: Weather, body: Body | None, record: bool | None, progress: Callable[[float, float], None],
+) -> Trace:  # fmt: skip
+    protocol = _with_gains(ROUNDS[settings.protocol.kind or ""](), settings.protocol)
+    return simulate_rounds(
+        team, protocol, copies, schedule.final, size.length, first, convex=bool(shape_of(team).concave.all()), rounds=rounds, stop=stop,
+        weather=weather, body=body, record=record, progress=progress,
+        proven=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
+    )  # fmt: skip
+
+
+def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) -> np.ndarray:
     """(C, d) first estimates, drawn where nothing is given; the row of each agent's own position is its start (paper, section IV-E).
 
     Raises:
@@ -108,7 +164,7 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale | N
     """
     d = team.dimension
     if start.box is None:
-        low, high = start_box(size or scale(team))
+        low, high = start_box(size)
     else:
         low, high = (np.atleast_1d(np.asarray(side, dtype=float)) for side in start.box)
         if len(low) not in (1, d):
@@ -122,14 +178,13 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale | N
     return first
 
 
-def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, trace: Trace, full: bool) -> dict[str, Any]:
+def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
     """What ``run --json`` prints (schema consat.run/1)."""
     team, position = scenario.team, trace.position[-1]
-    observer, nu = Objective.at_positions(team), schedule.final
-    margins = np.asarray(observer.psi(jnp.asarray(position)))
-    multipliers = np.asarray(observer.multipliers(jnp.asarray(position), nu))
+    nu = schedule.final
+    margins, multipliers = map(np.asarray, _final(Objective.at_positions(team), jnp.asarray(position), nu))
     margin = _number(margins.min(initial=np.inf))
-    verdict = "feasible" if margin is not None and margin > 0 else "undecided"
+    certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
     return {
         "schema": SCHEMA,
@@ -138,11 +193,11 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, trace:
         "protocol": settings.protocol.kind,
         "estimates": settings.protocol.estimates,
         "seed": settings.start.seed,
-        "status": _status(trace, margin, verdict),
-        "verdict": verdict,
+        "status": _status(trace, margin, certificate.verdict, size.length),
+        "verdict": certificate.verdict,
         "margin": margin,
         "smooth_margin": _number(trace.smooth_margin[-1]),
-        "bounds": [margin, None],
+        "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
         "satisfied_from": {
             "time": trace.satisfied_from if trace.clock == "time" else None,
             "round": trace.satisfied_from if trace.clock == "round" else None,
@@ -161,6 +216,11 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, trace:
     }
 
 
+@jax.jit
+def _final(observer: Objective, position: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
+    return observer.psi(position), observer.multipliers(position, nu)
+
+
 def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
     if isinstance(team, Scenario):
         return team
@@ -168,28 +228,27 @@ def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
         return load(team)
     try:
         text = dump(team, Settings(), "team")
-    except InvalidTeam:
+    except InvalidInput:
         text = ""
     return Scenario(name="team", team=team, settings=Settings(), text=text, source="team")
 
 
-def _flow(asked: ProtocolSettings) -> Flow:
-    if asked.kind not in FLOWS:
-        raise InvalidSettings(f"there is no protocol {asked.kind!r}; choose one of {', '.join(FLOWS)}")
-    flow = FLOWS[asked.kind]()
-    gains = {key: value for key, value in (("k1", asked.k1), ("k2", asked.k2)) if value is not None}
-    known = {field.name for field in dataclasses.fields(flow)}  # type: ignore[arg-type]
-    if unknown := gains.keys() - known:
+def _with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
+    """The protocol with the gains that the scenario asks for."""
+    gains = {key: value for key, value in asked.model_dump().items() if key not in ("kind", "estimates") and value is not None}
+    if unknown := gains.keys() - {field.name for field in dataclasses.fields(protocol)}:
         raise InvalidSettings(f"protocol {asked.kind} has no gain {', '.join(sorted(unknown))}; leave it out")
-    return dataclasses.replace(flow, **gains)  # type: ignore[type-var]
+    return dataclasses.replace(protocol, **gains)
 
 
-def _status(trace: Trace, margin: float | None, verdict: str) -> str:
+def _status(trace: Trace, margin: float | None, verdict: str, length: float) -> str:
     if trace.ending == "diverged":
         return "diverged"
     if margin is not None and margin > 0:
         return "satisfied"
-    return "least-violating" if verdict == "infeasible" else "not-converged"
+    lately = trace.position[-min(10, len(trace.position)) :]
+    arrived = len(trace.position) > 10 and np.abs(lately - lately[-1]).max(initial=0.0) <= AT_REST * length
+    return "least-violating" if verdict == "infeasible" and arrived else "not-converged"
 
 
 def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray) -> Mapping[str, Any]:

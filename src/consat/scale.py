@@ -7,12 +7,15 @@ same team in kilometres get the same ν·ψ, and take the same rounds.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from consat.constraints.curvature import expand
 from consat.numerics import float64
 from consat.settings import Smoothing
 from consat.team import Family, Team
@@ -68,16 +71,25 @@ def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
     return size.center - half, size.center + half
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _second_order(psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
+    def flat(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
+        return psi(*x.reshape(arity, dimension), **parameters)
+
+    def both(parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
+        origin = jnp.zeros(arity * dimension)
+        return (*jax.value_and_grad(flat)(origin, parameters), jax.hessian(flat)(origin, parameters))
+
+    return jax.vmap(both)(parameters)
+
+
 def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Scale, ‖H‖ and slope of each member, and the stationary points of those that read one agent alone."""
 
-    def psi(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
-        return family.psi(*x.reshape(family.arity, dimension), **parameters)
-
-    parameters = {key: jnp.asarray(value) for key, value in family.parameters.items()}
-    origin = jnp.zeros(family.arity * dimension)
-    value, b = (np.asarray(a) for a in jax.vmap(jax.value_and_grad(psi), (None, 0))(origin, parameters))
-    hessian = np.asarray(jax.vmap(jax.hessian(psi), (None, 0))(origin, parameters))
+    try:
+        value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
+    except ValueError:  # beyond degree 2: to second order about the origin
+        value, b, hessian = (np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters)))
     usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & np.isfinite(hessian).all(axis=(1, 2))
     value, b, hessian = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (value, b, hessian))
     stationary = -np.einsum("mij,mj->mi", np.linalg.pinv(hessian, hermitian=True), b)

@@ -92,14 +92,20 @@ class ProtocolSettings(Model):
     Attributes:
         kind: its name; None for the default.
         estimates: who holds copies: ``local`` what is needed, ``full`` everything (the paper).
-        k1: gain on the gradient.
-        k2: gain on the disagreement.
+        k1: gain of a flow on the gradient.
+        k2: gain of a flow on the disagreement.
+        penalty: ρ of admm at the start, in 1/length², the team's unit.
+        relaxation: a of admm, between 0 and 1.
+        step: c of proximal, in length².
     """
 
     kind: ProtocolKind | None = Field(None, description=f"one of {', '.join(get_args(ProtocolKind))}")
     estimates: Literal["local", "full"] = Field("local", description="local or full")
     k1: Gain | None = Field(None, description="a positive number")
     k2: Gain | None = Field(None, description="a positive number")
+    penalty: Gain | None = Field(None, description="a positive number")
+    relaxation: Annotated[Gain, Field(lt=1)] | None = Field(None, description="a number between 0 and 1")
+    step: Gain | None = Field(None, description="a positive number")
 
 
 class Settings(Model):
@@ -108,6 +114,3 @@ class Settings(Model):
     start: Start = Field(Start(), description="a mapping such as {box: [-4, 4], seed: 0}")
     protocol: ProtocolSettings = Field(ProtocolSettings(), description="a mapping such as {kind: admm, estimates: local}")
     smoothing: Smoothing | Literal["auto"] = Field("auto", description="auto, or a mapping such as {nu_alpha: 5, nu_beta: 5}")
-    until: Gain | None = Field(None, description="a positive number")
-    rounds: Annotated[int, Field(ge=0)] | None = Field(None, description="a whole number")
-    stop: Literal["satisfied", "converged", "never"] | None = Field(None, description="satisfied, converged or never")

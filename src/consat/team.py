@@ -125,7 +125,7 @@ class Team:
             _trace(entries, self.dimension, faults)
             for i, agent in enumerate(agents):
                 if agent.start is not None:
-                    start = _vector(agent.start, self.dimension, ("agents", i, "start"), "start", f"agent {agent.id!r}", faults)
+                    start = _vector(agent.start, self.dimension, ("agents", i, "start"), "start", _who(i, agent.id), faults)
                     self.starts[i] = np.nan if start is None else start
         pairs = _pairs(links, index, faults)
         if faults:
@@ -135,6 +135,17 @@ class Team:
         self.names = tuple(entry.name for entry in entries)
         self.families = _families(entries)
         self.links = _unique(pairs) if pairs is not None else topology(cast(str, links), len(agents), self.families)
+
+    @classmethod
+    def of_parts(
+        cls, ids: Sequence[str], families: Iterable[Family], owner: np.ndarray, names: Sequence[str],
+        links: np.ndarray, starts: np.ndarray, dimension: int,
+    ) -> Team:  # fmt: skip
+        """A team from parts that are known to fit together, such as those of another team; see the attributes of `Team`."""
+        team = cls.__new__(cls)
+        team.ids, team.families, team.owner, team.names = ids, tuple(families), owner, names
+        team.links, team.starts, team.dimension = links, starts, dimension
+        return team
 
     @property
     def count(self) -> int:
@@ -183,18 +194,23 @@ def _index(agents: Sequence[Agent], faults: list[Fault]) -> dict[str, int]:
     return index
 
 
+def _who(i: int, name: Any) -> str:
+    return f"agent {name!r}" if isinstance(name, str) and name.strip() else f"agents[{i}]"
+
+
 def _entries(agents: Sequence[Agent], index: Mapping[str, int], dimension: int, faults: list[Fault]) -> Iterator[_Entry]:
     for i, agent in enumerate(agents):
         taken: dict[str, int] = {}
+        who = _who(i, agent.id)
         for k, item in enumerate(agent.constraints):
             path: Path = ("agents", i, "constraints", k)
             for constraint in _flatten(item):
                 if not isinstance(constraint, Constraint):
-                    faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", f"agent {agent.id!r}"))
+                    faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", who))
                     continue
                 named = len(faults)
-                name = _name(constraint, taken, path, agent.id, faults)
-                where = f"agent {agent.id!r}, constraint {name!r}"
+                name = _name(constraint, taken, path, agent.id, who, faults)
+                where = f"{who}, constraint {name!r}"
                 reads = _reads(constraint, agent.id, index, path, where, faults)
                 entry = _Entry(constraint, i, reads, name, path, where)
                 for key, parameter in constraint.parameters.items():
@@ -215,14 +231,14 @@ def _flatten(item: Any) -> Iterator[Any]:
         yield item
 
 
-def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, faults: list[Fault]) -> str:
+def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, who: str, faults: list[Fault]) -> str:
     """The user's name, or one derived from the kind and the other agents, numbered where it repeats."""
     if constraint.name is not None:
         if not isinstance(constraint.name, str) or not constraint.name.strip() or not constraint.name.isprintable():
-            faults.append(Fault((*path, "name"), f"name is {constraint.name!r}, but must be a printable text", f"agent {owner!r}"))
+            faults.append(Fault((*path, "name"), f"name is {constraint.name!r}, but must be a printable text", who))
         elif constraint.name in taken:
-            message = f"name {constraint.name!r} is taken by another constraint of agent {owner!r}; choose another"
-            faults.append(Fault((*path, "name"), message, f"agent {owner!r}"))
+            message = f"name {constraint.name!r} is taken by another constraint of {who}; choose another"
+            faults.append(Fault((*path, "name"), message, who))
         else:
             taken[constraint.name] = 1
         return str(constraint.name)

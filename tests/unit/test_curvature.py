@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
+from consat.constraints import apart, box, composition, constraint, curvature, displacement, expr, halfspace, near, outside, within
 from consat.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
 from consat.constraints.functions import safe_norm
 
@@ -39,22 +39,33 @@ def _values(constraint: Any) -> dict[str, Any]:
         (lambda d: box(-np.ones(d), np.ones(d))[0], CONCAVE, (False,), 1),
         (lambda d: box(-np.ones(d), np.ones(d))[-1], CONCAVE, (False,), 1),
         (lambda d: expr("2**2 - norm2(a2 - a3)"), CONCAVE, (True, True), 2),
-        (lambda d: expr("2 - norm(a2 - a3)"), CONCAVE, (False, False), None),
-        (lambda d: expr("norm(a2 - a3) - 2"), NOT, (False, False), None),
-        (lambda d: expr("4 - norm(a2 - a3)**2"), CONCAVE, (True, True), 2),
+        (lambda d: constraint(lambda x, y: 2 - safe_norm(x - y), ("i", "j")), CONCAVE, (False, False), None),
+        (lambda d: constraint(lambda x, y: safe_norm(x - y) - 2, ("i", "j")), NOT, (False, False), None),
+        (lambda d: constraint(lambda x, y: 4 - safe_norm(x - y) ** 2, ("i", "j")), CONCAVE, (True, True), 2),
         (lambda d: expr("9 - norm2(a2) - log(exp(a2.x) + exp(a3.x))"), CONCAVE, (True, False), None),
         (lambda d: expr("2 - sqrt(norm2(a2) + 0.01)"), STRICTLY, (True,), None),
     ],
 )
 def test_library_kind(make: Callable[[int], Any], kind: Curvature, strict_in: tuple[bool, ...], power: int | None, d: int) -> None:
-    constraint = make(d)
+    made = make(d)
     arity = len(strict_in)
-    reading = read_curvature(constraint.psi, arity, d, _values(constraint))
-    assert reading == curvature.Reading(kind, strict_in, power)
-    assert degree(constraint.psi, arity, d, _values(constraint)) == power
+    assert read_curvature(made.psi, arity, d, _values(made)) == curvature.Reading(kind, strict_in, power)
+    assert degree(made.psi, arity, d, _values(made)) == power
 
 
 # ------------------------------------------------------------------------------------------------------- rule by rule, d = 2
+
+
+@jax.custom_vjp
+def _square_by_hand(v: Any) -> Any:
+    return v**2
+
+
+def _minus_same_times_same(v: Any) -> Any:
+    return -(v * v)
+
+
+_square_by_hand.defvjp(lambda v: (v**2, v), lambda v, t: (2 * v * t,))
 
 RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     # degree and Hessian
@@ -95,6 +106,7 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "vmap": (lambda x, a, b, c: -jax.vmap(lambda p: jnp.sum((x - p) ** 2))(jnp.eye(2)).sum(), STRICTLY),
     "known where": (lambda x, a, b, c: jnp.where(jnp.array([True, False]), -(x**2), c).sum(), CONCAVE),
     "checkpoint": (lambda x, a, b, c: jax.checkpoint(lambda y: -jnp.sum(y**2))(x), STRICTLY),
+    "custom vjp": (lambda x, a, b, c: _square_by_hand(x[0]) * b, CONCAVE),
     "jit": (lambda x, a, b, c: jax.jit(lambda y: -jnp.sum(y**2))(x), STRICTLY),
     # functions of one number
     "exp": (lambda x, a, b, c: -jnp.exp(x[0]), CONCAVE),
@@ -169,7 +181,7 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "weights of both signs": (lambda x, a, b, c: c @ jnp.abs(x), NOT),
     "weights of one sign": (lambda x, a, b, c: -jnp.abs(c) @ jnp.abs(x), CONCAVE),
     "product of convex": (lambda x, a, b, c: -jnp.abs(x[0]) * jnp.abs(x[1]), NOT),
-    "same times same": (lambda x, a, b, c: (lambda y: -(y * y))(safe_norm(x)), STRICTLY),
+    "same times same": (lambda x, a, b, c: _minus_same_times_same(safe_norm(x)), STRICTLY),
     "logsumexp": (lambda x, a, b, c: a - jax.nn.logsumexp(x), CONCAVE),
     "logsumexp of convex": (lambda x, a, b, c: -jax.nn.logsumexp(jnp.stack([x @ x, x[0], 1.0 + 0 * x[0]])), CONCAVE),
     "logsumexp of concave": (lambda x, a, b, c: -jax.nn.logsumexp(jnp.stack([-(x @ x), x[0]])), NOT),
@@ -203,7 +215,7 @@ def test_rule(name: str) -> None:
         return
     x = np.array([0.3, -1.7])
     with jax.enable_x64(True):
-        exact = jax.hessian(lambda x: psi(x, **jax.tree.map(jnp.asarray, PARAMETERS)))(x)
+        exact = jax.jacrev(jax.grad(lambda x: psi(x, **jax.tree.map(jnp.asarray, PARAMETERS))))(x)
     ours = hessians(psi, 1, 2, jax.tree.map(lambda value: np.asarray(value)[None], PARAMETERS))[0]
     if np.isfinite(exact).all():
         np.testing.assert_allclose(ours, exact, rtol=1e-12, atol=1e-13)
@@ -224,7 +236,9 @@ def test_members_are_read_each_for_itself() -> None:
     for psi in families:
         together = read_curvatures(psi, 2, 2, stacked)
         assert set(together.curvature) >= {CONCAVE, NOT}
-        assert [together[m] for m in range(12)] == [read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)]
+        assert [together[m] for m in range(12)] == [
+            read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)
+        ]
 
 
 def test_work_in_python_does_not_grow_with_members(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,7 +304,7 @@ def test_psi_must_be_a_number() -> None:
         (lambda x, p: x[0] * x[1] * p - safe_norm(p * x) ** 2, 2),
         (lambda x, p: x[0] * x[1] * (x[0] - p), None),
         (lambda x, p: x[0] ** p, None),
-        (lambda x, p: p**x[0], None),
+        (lambda x, p: p ** x[0], None),
         (lambda x, p: jnp.where(p > 0, x[0], x[0] ** 2), None),
         (lambda x, p: jnp.maximum(x[0], p), None),
         (lambda x, p: jnp.sqrt(x[0] - p) ** 2, None),
@@ -317,7 +331,7 @@ def test_degree_may_be_less_for_given_values() -> None:
         (lambda x, y, c, r: jnp.sum((x - y) ** 2) - r**2, NOT),
         (lambda x, y, c, r: r - safe_norm(x - y - c), CONCAVE),
         (lambda x, y, c, r: r - jnp.sqrt(jnp.sum((x - c) ** 2) + r**2) - jnp.sqrt(jnp.sum((x - y) ** 2) + r**2), CONCAVE),
-        (lambda x, y, c, r: jnp.sqrt(jnp.sum((x - c) ** 2) - r**2) - r, NOT),
+        (lambda x, y, c, r: jnp.exp(-jnp.sum((x - c) ** 2) / r**2), NOT),
     ],
 )
 def test_units_do_not_matter(psi: Callable[..., Any], expected: Curvature, unit: float) -> None:
@@ -346,6 +360,23 @@ def test_name_of_a_function_proves_nothing() -> None:
 
     logaddexp.defjvps(lambda t, ans, a, b: t, lambda t, ans, a, b: t)
     assert read_curvature(lambda x: -logaddexp(x[0], x[1]), 1, 2, {}).curvature == NOT
+
+
+def test_far_from_the_origin() -> None:
+    """In the coordinates of a map, squares are 10¹³ and a radius² is 0.1: what the cancellation swallows must not be taken as proven."""
+    c = np.array([5e5, 5e6])
+    parameters = {"c": c, "r": 0.3}
+    assert read_curvature(lambda x, c, r: r - safe_norm(x - c), 1, 2, parameters).curvature == CONCAVE
+    assert read_curvature(lambda x, c, r: r - jnp.abs(jnp.sum((x - c) ** 2) - r**2), 1, 2, parameters).curvature == NOT
+    assert read_curvature(lambda x, c, r: r - jnp.abs(x @ x - 2 * (c @ x) + c @ c - r**2), 1, 2, parameters).curvature != CONCAVE
+
+
+def test_size_of_what_is_cancelled_matters() -> None:
+    """Members whose second-order parts cancel up to rounding are affine; those that leave 1e-9 of them are not."""
+    rest = np.array([-1e-9, 0.0, 1e-9])
+    readings = read_curvatures(lambda x, k: (0.1 + k) * x[0] ** 2 * 3 - 0.3 * x[0] ** 2 - x[1], 1, 2, {"k": rest})
+    assert list(readings.curvature) == [CONCAVE, CONCAVE, NOT]
+    assert list(readings.strict_in[:, 0]) == [False, False, False]
 
 
 # ---------------------------------------------------------------------------------------------------------------- safe_norm
@@ -586,7 +617,7 @@ def test_random_functions_are_refuted(seed: int) -> None:
     seen: Counter[Curvature] = Counter()
     for _ in range(3):
         psi = RandomPsi(_random_tree(rng, 2, 3))
-        numbers = np.round(rng.uniform(-3, 3, (60, NUMBERS)), 1)
+        numbers = np.round(rng.uniform(-3, 3, (30, NUMBERS)), 1)
         readings = read_curvatures(psi, 1, 2, {"numbers": numbers})
         for reading, member in zip(readings, numbers, strict=True):
             _check(psi, reading, member, rng, 2)

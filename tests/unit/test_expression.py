@@ -395,7 +395,8 @@ FORBIDDEN = [
     # syntax
     "lambda: a1", "lambda a1: a1.x", "[x for x in a1]", "sum(x for x in a1)", "{x: x for x in a1}", "{a1}", "{}", "{'a': 1}",
     "f'{a1}'", "f'a1'", "f'{a1.x!r:>{10}}'", "b'a1'", "u'a1'", "'''a1'''", "'\\x61'", "(a := 1)", "a := 1", "*a1", "norm2(*a1)",
-    "norm2(**a1)", "norm2(*[a1])", "norm2(a1, v=a1)", "norm2(a1, **a2)", "dot(a1, v=a1)", "[*a1]", "(a1,)", "()", "[]", "a1[:]", "a1[0:1]", "a1[0, 1]", "a1[a2]",
+    "norm2(**a1)", "norm2(*[a1])", "norm2(a1, v=a1)", "norm2(a1, **a2)", "dot(a1, v=a1)", "[*a1]",
+    "(a1,)", "()", "[]", "a1[:]", "a1[0:1]", "a1[0, 1]", "a1[a2]",
     "a1['x']", "a1[...]", "a1[1j]", "a1[[0]]", "True", "a1.x + True", "None", "a1.x + None", "...", "1j * a1.x", "not a1.x",
     "~a1.x", "a1.x // 2", "a1.x % 2", "a1 @ a2", "a1.x << 2", "a1.x & 2", "a1.x | 2", "a1 is a2", "a1 in a2", "a1 != a2",
     "a1.x or a1.y", "await a1", "yield a1", "(yield)", "a1; a2", "a1 \\\n + a1", "import os", "del a1", "a1 += 1", "return a1",

@@ -1,9 +1,8 @@
-"""What kind of function of the positions each intermediate of a trace is: degree, bounds, curvature.
+"""The calculus of curvature: what sums, products and functions of functions are, given what their parts are.
 
-`interpret` walks a jaxpr; `describe` is its step for `Node`s, with one rule for each primitive. The rules are those of disciplined convex
-programming (Grant, Boyd, Ye 2006, "Disciplined convex programming", section 6; Boyd, Vandenberghe 2004, "Convex optimization",
-sections 3.2 and 3.5), with two additions: polynomials of degree ≤ 2 are carried along exactly, coefficients and all, and sums of
-exponentials are known to be log-convex. A primitive without a rule yields an unknown function, never a guess.
+The rules are those of disciplined convex programming (Grant, Boyd, Ye 2006, "Disciplined convex programming", section 6; Boyd,
+Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5), with two additions: polynomials of degree ≤ 2 are carried along exactly,
+coefficients and all, and sums of exponentials are known to be log-convex.
 
 A `Node` describes an array, element by element, and a whole family of functions at once. The axes of its arrays are
 (members, *shape, *more); any of them may have length 1 and then stands for equal entries.
@@ -12,76 +11,30 @@ A `Node` describes an array, element by element, and a whole family of functions
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial, reduce
+from functools import cached_property, reduce
 from itertools import zip_longest
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-T = TypeVar("T")
 
 ROUNDING: Final = 1e-12
 """An eigenvalue below this, per row of its matrix, is zero, once every coordinate is scaled such that the terms summed into the matrix
 are at most 1. That is some thousand roundings, more than any constraint makes."""
 
-CALLS: Final = frozenset({"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"})
-"""Primitives whose value is that of the jaxpr they carry."""
 
-
-def interpret(
-    closed: core.ClosedJaxpr,
-    arguments: Sequence[T],
-    constant: Callable[[Any], T],
-    step: Callable[[core.JaxprEqn, Sequence[T]], Sequence[T] | None],
-) -> list[T]:
-    """Evaluate a jaxpr on values of any kind.
-
-    Args:
-        closed: the jaxpr.
-        arguments: what stands for its inputs.
-        constant: makes such a value of a number or array.
-        step: evaluates one equation, or answers None to one of `CALLS`, whose body is then entered.
-    """
-    env: dict[Any, T] = dict(zip(closed.jaxpr.invars, arguments, strict=True))
-    env.update(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
-
-    def read(atom: Any) -> T:
-        return constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, core.Literal) else env[atom]
-
-    for eqn in closed.jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
-        outputs = step(eqn, inputs)
-        env.update(zip(eqn.outvars, interpret(body(eqn), inputs, constant, step) if outputs is None else outputs, strict=True))
-    return [read(atom) for atom in closed.jaxpr.outvars]
-
-
-def body(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
-    """The jaxpr that one of `CALLS` carries."""
-    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
-    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
-
-
-def evaluate(eqn: core.JaxprEqn, *inputs: Any) -> list[Any]:
-    """One equation, not of `CALLS`, on arrays."""
-    out = eqn.primitive.bind(*inputs, **eqn.params)
-    return list(out) if eqn.primitive.multiple_results else [out]
-
-
-def signs(matrix: Array, size: Array) -> tuple[Array, Array]:
+def signs(matrix: Array, size: Array, rounding: float = ROUNDING) -> tuple[Array, Array]:
     """Signs of the smallest and the largest eigenvalue of symmetric matrices; −1 and 1 if not finite.
 
     By Sylvester's law of inertia a congruence keeps them, so each coordinate is first scaled to a unit of its own, such that no row of
-    `size`, which bounds the terms that were added up to `matrix`, exceeds 1. What then lies below `ROUNDING` may be rounding.
+    `size`, which bounds the terms that were added up to `matrix`, exceeds 1. What then lies below `rounding`, per row, counts as 0.
     """
     matrix, size = np.broadcast_arrays(matrix, size)
-    finite = np.isfinite(size).all((-1, -2)) & np.isfinite(matrix).all((-1, -2))
+    finite = np.asarray(np.isfinite(size + matrix).all((-1, -2)))
     matrix, size = (np.where(finite[..., None, None], each, 0) for each in (matrix, size))
     scale = np.ones(size.shape[:-1])
     for _ in range(8):  # Ruiz equilibration
@@ -90,7 +43,7 @@ def signs(matrix: Array, size: Array) -> tuple[Array, Array]:
             break
         scale /= np.sqrt(np.where(row > 0, row, 1))
     eigenvalues = np.linalg.eigvalsh(matrix * scale[..., :, None] * scale[..., None, :])
-    eigenvalues[np.abs(eigenvalues) <= ROUNDING * matrix.shape[-1]] = 0
+    eigenvalues[np.abs(eigenvalues) <= rounding * matrix.shape[-1]] = 0
     return np.where(finite, np.sign(eigenvalues[..., 0]), -1), np.where(finite, np.sign(eigenvalues[..., -1]), 1)
 
 
@@ -110,8 +63,8 @@ class Bend(NamedTuple):
         convex: bool.
         concave: bool.
         logconvex: bool; positive, with a convex logarithm (hence convex).
-        strict: bool, with one more axis of length arity + 2. Given that the element is convex or concave, whether it is strictly so: jointly,
-            in each position alone, and (last) in the weakest sense, not affine.
+        strict: bool, with one more axis of length arity + 2. Given that the element is convex or concave, whether it is
+            strictly so: jointly, in each position alone, and (last) in the weakest sense, not affine.
     """
 
     convex: Array
@@ -154,8 +107,11 @@ class Node:
         """How it bends; of a quadratic by its eigenvalues."""
         one, more = (1,) * (len(self.shape) + 1), (1,)
         no, yes, none = np.zeros(one, bool), np.ones(one, bool), np.zeros(one + more, bool)
+        if self.value is not None:
+            finite = np.isfinite(self.value)
+            return Bend(finite, finite, finite & (self.value > 0), none)
         if self.degree in {0, 1}:
-            return Bend(yes, yes, no if self.value is None else self.value > 0, none)
+            return Bend(yes, yes, no, none)
         if self.terms is None:
             return self.rule or Bend(no, no, no, none)
         hessian, size = self.terms[2], self.sizes[2]
@@ -167,11 +123,18 @@ class Node:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """`low` and `high`, sharpened by the sign of a quadratic: q ≥ 0 iff [[H, b], [bᵀ, 2c]] is positive semidefinite."""
+        """`low` and `high`, sharpened by the sign of a quadratic, if it is clear."""
         if self.degree != 2 or self.terms is None:
             return self.low, self.high
-        least, largest = signs(_lifted(self.terms), _lifted(self.sizes))
-        return np.where(least >= 0, np.maximum(self.low, 0), self.low), np.where(largest <= 0, np.minimum(self.high, 0), self.high)
+        above, below = _nonnegative(self, 1e-9), _nonnegative(negative(self), 1e-9)
+        return np.where(above, np.maximum(self.low, 0), self.low), np.where(below, np.minimum(self.high, 0), self.high)
+
+
+def _nonnegative(q: Node, margin: float, rounding: float = ROUNDING) -> Array:
+    """Whether a quadratic is ≥ 0 everywhere, even if its constant term were less by `margin`: iff [[H, b], [bᵀ, 2c]] is so definite."""
+    matrix, size = _lifted(q.terms or ()), _lifted(q.sizes)
+    matrix[..., -1, -1] -= margin * size[..., -1, -1]
+    return signs(matrix, size, rounding)[0] >= 0
 
 
 def _lifted(terms: tuple[Array, ...]) -> Array:
@@ -228,29 +191,25 @@ def arranged(nodes: Sequence[Node], index: Array) -> Node:
         together = flat[0] if len(flat) == 1 else np.concatenate(flat, axis=1)
         return np.take(together, index, axis=1) if index.ndim else together[:, int(index)]
 
-    def pool_terms(terms: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
-        zeros = [np.zeros((1,) * (1 + len(node.shape))) for node in nodes]
-        orders = range(max(map(len, terms)))
-        padded = [
-            [
-                part[order] if order < len(part) else zero.reshape(*zero.shape, *(1,) * 2 * order)
-                for part, zero in zip(terms, zeros, strict=True)
-            ]
-            for order in orders
-        ]
-        return tuple(pool(*parts) for parts in padded)
-
     degree = _highest(node.degree for node in nodes)
     low, high = pool(*(node.low for node in nodes)), pool(*(node.high for node in nodes))
     made = ("arranged", tuple(nodes))
     known = [node.terms for node in nodes if node.terms is not None]
     if len(known) == len(nodes) and degree is not None:
-        return Node(index.shape, degree, low, high, pool_terms(known), pool_terms([node.sizes for node in nodes]), made=made)
+        terms, sizes = (
+            tuple(pool(*(_term(node, each, order) for node, each in zip(nodes, parts, strict=True))) for order in range(degree + 1))
+            for parts in (known, [node.sizes for node in nodes])
+        )
+        return Node(index.shape, degree, low, high, terms, sizes, made=made)
     rule = Bend(*(pool(*parts) for parts in zip(*(node.bend for node in nodes), strict=True)))
     return Node(index.shape, degree, low, high, rule=rule, made=made)
 
 
-def _highest(degrees: Any) -> int | None:
+def _term(node: Node, terms: tuple[Array, ...], order: int) -> Array:
+    return terms[order] if order < len(terms) else np.zeros((1,) * (1 + len(node.shape) + 2 * order))
+
+
+def _highest(degrees: Iterable[int | None]) -> int | None:
     known = list(degrees)
     return None if None in known else max(known)
 
@@ -329,8 +288,8 @@ def times(a: Node, b: Node) -> Node:
         logconvex = bend.logconvex & b.bend.logconvex
         return replace(node, rule=Bend(logconvex, np.zeros_like(logconvex), logconvex, np.zeros((*logconvex.shape, 1), bool)))
     k, finite = b.value, np.isfinite(b.value)
-    convex = np.where(k >= 0, bend.convex, bend.concave) | (k == 0)
-    concave = np.where(k >= 0, bend.concave, bend.convex) | (k == 0)
+    convex = ((k >= 0) & bend.convex) | ((k <= 0) & bend.concave)
+    concave = ((k >= 0) & bend.concave) | ((k <= 0) & bend.convex)
     return replace(node, rule=Bend(convex & finite, concave & finite, bend.logconvex & (k > 0), bend.strict & (k != 0)[..., None]))
 
 
@@ -353,7 +312,7 @@ def larger(a: Node, b: Node) -> Node:
     """The maximum of convex functions is convex."""
     a, b = _aligned(a, b)
     for one, two in ((a, b), (b, a)):
-        if np.all(one.bounds[0] >= two.bounds[1]):
+        if two.value is not None and np.all(one.bounds[0] >= two.value):
             return one
     low, high = np.maximum(a.bounds[0], b.bounds[0]), np.maximum(a.bounds[1], b.bounds[1])
     if a.degree == b.degree == 0:
@@ -523,38 +482,40 @@ def _composed(facts: Atom, a: Node) -> Node:
 
 
 def _cone(q: Node, bend: Bend) -> Bend:
-    """√q for a quadratic q: convex if q = ‖affine‖² + constant ≥ 0, and then strictly so wherever q is, if the constant is positive."""
-    lifted, size = _lifted(q.terms or ()), _lifted(q.sizes)
-    cone = signs(lifted, size)[0] >= 0
-    lifted[..., -1, -1] -= 1e-6 * size[..., -1, -1]
-    smooth = (signs(lifted, size)[0] >= 0) & (size[..., -1, -1] > 0)
-    strict = q.bend.strict & np.where(np.arange(q.bend.strict.shape[-1]) < q.bend.strict.shape[-1] - 1, smooth[..., None], True)
+    """√q for a quadratic q: convex iff q ≥ 0 everywhere, so that q = ‖affine‖² + constant; if the constant is positive, then strictly so
+    wherever q is. Sums of squares show it by their bounds; for others the constant 0 must be recognised in spite of rounding."""
+    cone = (q.low >= 0) | _nonnegative(q, 0.0, 1e-14)
+    smooth = _nonnegative(q, 1e-6) & (q.sizes[0] > 0)
+    kind = np.arange(q.bend.strict.shape[-1]) < q.bend.strict.shape[-1] - 1
+    strict = q.bend.strict & (smooth[..., None] | ~kind)
     return bend._replace(convex=bend.convex | cone, strict=np.where(cone[..., None], strict, bend.strict))
 
 
 def power(a: Node, p: Array) -> Node:
     """a^p for known p."""
+    if np.all(p == 0):
+        return constant(np.ones((1,) * (len(a.shape) + 1)))
     if np.all(p == 1):
         return a
-    if a.degree == 0 or np.all(p == 0):
-        ones = np.ones((1,) * (len(a.shape) + 1))
-        return constant(ones if np.all(p == 0) else a.value**p) if a.value is not None or np.all(p == 0) else opaque(a.shape)
+    if a.degree == 0:
+        return opaque(a.shape) if a.value is None else constant(a.value**p)
+    if np.all(p == 2):
+        return square(a)
     if np.all(p == 0.5):
         return atom("sqrt", a)
     node = _composed(_power(p), a)
-    if not np.all(p == 2):
-        curved = (p != 0) & (p != 1)
-        bend = node.bend
-        return replace(node, rule=bend._replace(strict=bend.strict & curved[..., None], logconvex=a.bend.logconvex & (p > 0)))
+    curved, bend = (p != 0) & (p != 1), node.bend
+    return replace(node, rule=bend._replace(strict=bend.strict & curved[..., None], logconvex=a.bend.logconvex & (p > 0)))
+
+
+def square(a: Node) -> Node:
+    """a², of a function that varies: a quadratic if a is affine or the root of one."""
     if a.made[0] == "sqrt" and np.all(a.made[1][0].bounds[0] >= 0):
         return a.made[1][0]
-    if a.degree == 1:
-        return (
-            replace(node, degree=2, terms=_product(a.terms, a.terms), sizes=_product(a.sizes, a.sizes))
-            if a.terms
-            else replace(node, degree=2)
-        )
-    return node
+    node = _composed(_power(np.array(2.0)), a)
+    if a.degree != 1:
+        return node
+    return replace(node, degree=2, terms=a.terms and _product(a.terms, a.terms), sizes=a.sizes and _product(a.sizes, a.sizes))
 
 
 def raised(base: Node, exponent: Node) -> Node:
@@ -565,124 +526,3 @@ def raised(base: Node, exponent: Node) -> Node:
     if base.value is not None and np.all(base.value > 0):
         return atom("exp", times(exponent, constant(np.log(base.value))))
     return unknown(base.shape, 0 if base.degree == exponent.degree == 0 else None)
-
-
-# ------------------------------------------------------------------------------------------------------- rules of primitives
-
-Rule = Callable[..., Node]
-
-RULES: Final[Mapping[str, Rule]] = {
-    "add": lambda a, b, **_: plus(a, b),
-    "add_any": lambda a, b, **_: plus(a, b),
-    "sub": lambda a, b, **_: minus(a, b),
-    "neg": lambda a, **_: negative(a),
-    "mul": lambda a, b, **_: times(a, b),
-    "div": lambda a, b, **_: times(a, power(b, np.array(-1.0))),
-    "max": lambda a, b, **_: larger(a, b),
-    "min": lambda a, b, **_: smaller(a, b),
-    "clamp": lambda low, a, high, **_: smaller(larger(a, low), high),
-    "square": lambda a, **_: power(a, np.array(2.0)),
-    "integer_pow": lambda a, *, y, **_: power(a, np.array(float(y))),
-    "rsqrt": lambda a, **_: power(a, np.array(-0.5)),
-    "pow": lambda a, b, **_: raised(a, b),
-    "reduce_sum": lambda a, *, axes, **_: fold(plus, a, axes),
-    "reduce_prod": lambda a, *, axes, **_: fold(times, a, axes),
-    "reduce_max": lambda a, *, axes, **_: fold(larger, a, axes),
-    "reduce_min": lambda a, *, axes, **_: fold(smaller, a, axes),
-    "dot_general": lambda a, b, *, dimension_numbers, **_: dot(a, b, dimension_numbers),
-    "logaddexp": lambda a, b: atom("log", plus(atom("exp", a), atom("exp", b))),
-    **{name: (lambda a, name=name, **_: atom(name, a)) for name in ATOMS},
-}
-"""What a primitive does to nodes. One that is missing makes an unknown function."""
-
-MOVERS: Final[Mapping[str, Callable[..., Any] | None]] = {
-    "copy": lambda _into, a, **_: a,
-    "convert_element_type": lambda _into, a, **_: a,
-    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), lambda into, a, **_: a.reshape(into)),
-    "broadcast_in_dim": lambda into, a, *, broadcast_dimensions, **_: np.broadcast_to(
-        a.reshape([dict(zip(broadcast_dimensions, a.shape, strict=True)).get(axis, 1) for axis in range(len(into))]), into
-    ),
-    "transpose": lambda _into, a, *, permutation, **_: a.transpose(permutation),
-    "rev": lambda _into, a, *, dimensions, **_: np.flip(a, dimensions),
-    "slice": lambda _into, a, *, start_indices, limit_indices, strides, **_: a[
-        tuple(map(slice, start_indices, limit_indices, strides or (1,) * a.ndim))
-    ],
-    "split": lambda _into, a, *, sizes, axis, **_: np.split(a, np.cumsum(sizes)[:-1], axis),
-    "concatenate": lambda _into, *parts, dimension, **_: np.concatenate(parts, dimension),
-    "stack": lambda _into, *parts, axis, **_: np.stack(parts, axis),
-    "select_n": lambda _into, which, *cases, **_: np.choose(which.astype(int), cases),
-    **dict.fromkeys(("pad", "gather", "dynamic_slice", "dynamic_update_slice", "scatter"), None),
-}
-"""Primitives that only rearrange entries, as they act on entry numbers; None: let JAX do it."""
-
-SELECTORS: Final[Mapping[str, slice]] = {
-    "select_n": slice(0, 1),
-    "gather": slice(1, 2),
-    "dynamic_slice": slice(1, None),
-    "dynamic_update_slice": slice(2, None),
-    "scatter": slice(1, 2),
-}
-"""Which operands of those say where entries go; they must be known, and the same for all members."""
-
-
-def describe(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> Sequence[Node] | None:
-    """The step of `interpret` for nodes: what the outputs of an equation are, given what its inputs are."""
-    name, outputs = eqn.primitive.name, [var.aval for var in eqn.outvars]
-    if name in CALLS:
-        return [RULES["logaddexp"](*inputs)] if _is_logaddexp(eqn) else None
-    if all(math.prod(each.shape) for each in (*inputs, *outputs)):
-        if name in RULES and np.issubdtype(outputs[0].dtype, np.floating):
-            node = RULES[name](*inputs, **eqn.params)
-            return [
-                node if node.shape == outputs[0].shape else arranged([node], np.arange(math.prod(node.shape)).reshape(outputs[0].shape))
-            ]
-        moved = _moved(eqn, inputs) if name in MOVERS else None
-        if moved is not None:
-            return moved
-    values = [node.value for node in inputs if node.value is not None]
-    if len(values) == len(inputs):
-        return [constant(value) for value in _evaluated(eqn, values)]
-    return [unknown(each.shape, 0 if all(node.degree == 0 for node in inputs) else None) for each in outputs]
-
-
-def _is_logaddexp(eqn: core.JaxprEqn) -> bool:
-    """Whether a call is `jax.numpy.logaddexp`, by what it does, not by its name."""
-    if eqn.primitive.name != "custom_jvp_call" or len(eqn.invars) != 2:
-        return False
-    operands = [jax.ShapeDtypeStruct(var.aval.shape, var.aval.dtype) for var in eqn.invars]
-    (reference,) = jax.make_jaxpr(jnp.logaddexp)(*operands).eqns
-    return str(body(reference)) == str(body(eqn))
-
-
-def _moved(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> list[Node] | None:
-    """What a primitive that rearranges entries does, found by letting it rearrange their numbers."""
-    name, outputs = eqn.primitive.name, [var.aval for var in eqn.outvars]
-    if not np.issubdtype(outputs[0].dtype, np.floating):
-        return None
-    selectors = range(len(inputs))[SELECTORS.get(name, slice(0))]
-    entries = [node for k, node in enumerate(inputs) if k not in selectors]
-    numbers = iter(
-        np.split(np.arange(total := sum(math.prod(node.shape) for node in entries)), np.cumsum([math.prod(n.shape) for n in entries]))
-    )
-    operands = []
-    for k, (node, var) in enumerate(zip(inputs, eqn.invars, strict=True)):
-        if k not in selectors:
-            operands.append(next(numbers).reshape(node.shape))
-        elif node.value is not None and len(node.value) == 1:
-            operands.append(np.broadcast_to(node.value[0], node.shape).astype(var.aval.dtype))
-        else:
-            return None
-    act = MOVERS[name]
-    moved = evaluate(eqn, *operands) if act is None else act(outputs[0].shape, *operands, **eqn.params)
-    indices = [np.asarray(index) for index in (moved if isinstance(moved, list) else [moved])]
-    inside = all(np.all((index >= 0) & (index < total)) for index in indices)  # out of bounds, a gather fills
-    return [arranged(entries, index) for index in indices] if inside else None
-
-
-def _evaluated(eqn: core.JaxprEqn, values: Sequence[Array]) -> list[Array]:
-    """A primitive applied to known constants."""
-    typed = [np.broadcast_to(v, (len(v), *var.aval.shape)).astype(var.aval.dtype) for v, var in zip(values, eqn.invars, strict=True)]
-    if all(len(value) == 1 for value in typed):
-        return [np.asarray(out)[None] for out in evaluate(eqn, *(value[0] for value in typed))]
-    shared = [None if len(value) == 1 else 0 for value in typed]
-    return list(map(np.asarray, jax.vmap(partial(evaluate, eqn), shared)(*(value[0] if len(value) == 1 else value for value in typed))))

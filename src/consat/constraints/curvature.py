@@ -19,8 +19,10 @@ Every `Node` describes a whole family at once: the leading axis of its arrays, o
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import zip_longest
 from typing import Any, Final, NamedTuple
 
@@ -30,18 +32,21 @@ import numpy as np
 from jax.extend import core
 from numpy.typing import ArrayLike, NDArray
 
-from consat.constraints.composition import CALLS, Node, arranged, block, constant, describe, evaluate, interpret, opaque, position, signs
+from consat.constraints.composition import Node, arranged, block, constant, opaque, position, signs
+from consat.constraints.tracing import CALLS, describe, evaluate, interpret
 
 Array = NDArray[Any]
 Psi = Callable[..., Any]
 
 EPSILON: Final = float(np.finfo(np.float64).eps)
+NUDGE: Final = 1e-7
 DOUBT: Final = 1e3
-"""How far a chord must run above ψ, as a multiple of what rounding can do to first order, to be beyond doubt."""
+"""How far a chord must run above ψ, as a multiple of what rounding is estimated to do, to be beyond doubt."""
+BLOCK: Final = 1 << 12
 CHUNK: Final = 1 << 22
 """Members are read in chunks of about this many matrix entries."""
 PROBES: Final = 1 << 14
-"""Points tried per family to refute concavity, but at least 4 and at most 64 per member."""
+"""Points tried per family to refute concavity, but at least 4 and at most 512 per member."""
 
 
 class Curvature(enum.StrEnum):
@@ -243,65 +248,90 @@ def _refuted(family: _Family, members: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Which of these members have a segment on which ψ dips below its chord, by more than rounding explains.
 
     Points are drawn about the origin and about the numbers among the parameters, at several scales; segments run through them along
-    the most convex direction of the Hessian, and along a random one. Only values of ψ count: derivatives merely say where to look.
+    the direction in which ψ is most convex at that scale, and along a random one.
     """
     numbers = [value[members].reshape(len(members), -1) for value in family.parameters.values() if value.dtype.kind in "iuf"]
     table = np.concatenate([np.zeros((len(members), 1)), *numbers], axis=1)
     rows, first, back = np.unique(table, axis=0, return_index=True, return_inverse=True)
-    n, count = family.arity * family.dimension, int(np.clip(PROBES // len(rows), 4, 64))
-    rng = np.random.default_rng(0)
-    start = rng.integers(rows.shape[1], size=(count, family.arity, 1)) + np.arange(family.dimension)
-    unit = np.where(rng.random((count, 1, 1)) < 0.5, 1, np.abs(rows[:, rng.integers(rows.shape[1], size=(count, 1, 1))]))
-    common, own = (unit * 10.0 ** rng.uniform(-2, 2, (count, 1, 1)) * (rng.random((count, 1, 1)) < chance) for chance in (0.5, 1.0))
-    near = rows[:, start % rows.shape[1]] * (rng.random((count, 1, 1)) < 0.5)
-    points = near + common * rng.normal(size=(count, 1, family.dimension)) + own * rng.normal(size=(count, family.arity, family.dimension))
-    points, reaches = points.reshape(len(rows), count, n), np.broadcast_to(own[..., 0, 0], (len(rows), count))
-    directions = rng.normal(size=(count, n)) / np.sqrt(n)
-    parameters = {key: value[members[first]] for key, value in family.parameters.items()}
-    batch = min(len(rows), max(1, PROBES // count))
-    with jax.enable_x64(True):
-        dips = jax.jit(jax.vmap(jax.vmap(_dip(family), (None, 0, 0, 0)), (0, 0, 0, None)))
-        found = np.zeros(len(rows), bool)
-        for start_row in range(0, len(rows), batch):
-            some = np.arange(start_row, start_row + batch) % len(rows)
-            found[some] = dips({key: value[some] for key, value in parameters.items()}, points[some], reaches[some], directions).any(axis=1)
+    count = int(np.clip(PROBES // len(rows), 4, 512))
+    evaluated = _evaluator(family)
+    found = np.zeros(len(rows), bool)
+    for chunk in np.array_split(np.arange(len(rows)), math.ceil(len(rows) * count / PROBES)):
+        points, reach = _probes(rows[chunk], count, family.arity, family.dimension)
+        values = partial(evaluated, members[first[chunk]])
+        found[chunk] = _dips(values, points, reach).any(axis=1)
     return found[back]
 
 
-def _dip(family: _Family) -> Callable[..., jax.Array]:
-    """From parameters, a point, a scale and a direction to whether ψ dips below its chord thereabouts."""
-    floats = [aval for aval in _computed(family.trace) if jnp.issubdtype(aval.dtype, jnp.floating)]
+def _probes(rows: Array, count: int, arity: int, d: int) -> tuple[Array, Array]:
+    """Points (members, count, arity * d) and scales (members, count, 1) at which to look, given the numbers of every member."""
+    rng = np.random.default_rng(0)
+    start = rng.integers(rows.shape[1], size=(count, arity, 1)) + np.arange(d)
+    about = rows[:, start % rows.shape[1]] * (rng.random((count, 1, 1)) < 0.5)
+    unit = np.where(rng.random((count, 1, 1)) < 0.5, 1, np.abs(rows[:, rng.integers(rows.shape[1], size=(count, 1, 1))]))
+    common, own = (unit * 10.0 ** rng.uniform(-2, 2, (count, 1, 1)) for _ in range(2))
+    common = common * (rng.random((count, 1, 1)) < 0.5)
+    points = about + common * rng.normal(size=(count, 1, d)) + own * rng.normal(size=(count, arity, d))
+    return points.reshape(len(rows), count, arity * d), np.broadcast_to(own[..., 0], (len(rows), count, 1))
+
+
+@np.errstate(all="ignore")
+def _dips(values: Callable[[Array], tuple[Array, Array]], points: Array, reach: Array) -> NDArray[np.bool_]:
+    """Whether ψ dips below its chord about each of these points."""
+    n = points.shape[-1]
+    unit = np.eye(n)
+    row, column = np.triu_indices(n)
+    corners, _ = values(points[..., None, :] + reach[..., None] * np.concatenate([0 * unit[:1], unit, unit[row] + unit[column]]))
+    ends = corners[..., 1 : n + 1] - corners[..., :1]
+    hessian = np.zeros((*points.shape, n))  # by differences, so that it sees the kinks within reach; the scale does not matter
+    hessian[..., column, row] = corners[..., n + 1 :] - corners[..., :1] - ends[..., row] - ends[..., column]
+    steepest = np.linalg.eigh(np.where(np.isfinite(hessian), hessian, 0))[1][..., -1]
+    random = np.random.default_rng(1).normal(size=points.shape) / np.sqrt(n)
+    offsets = np.concatenate([step * reach[..., None] * np.stack([steepest, random], axis=-2) for step in (0.01, 0.1, 1.0, 10.0)], axis=-2)
+    (left, middle, right), noise = (
+        np.moveaxis(each, -1, 0) for each in values(points[..., None, None, :] + np.array([[-1.0], [0.0], [1.0]]) * offsets[..., None, :])
+    )
+    return np.any(np.isfinite(noise.sum(0)) & ((left + right) / 2 - middle > DOUBT * noise.sum(0)), axis=-1)
+
+
+def _evaluator(family: _Family) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """From members (m,) and points (m, …, n) to ψ there, and to what rounding may have done to it.
+
+    That is estimated as in Monte Carlo arithmetic (Parker 1997): every number computed on the way is nudged at random, relative to its
+    own size, and the outcome compared.
+    """
+    n, rng = family.arity * family.dimension, np.random.default_rng(2)
+    shapes = [(n,), *(aval.shape for aval in _computed(family.trace) if np.issubdtype(aval.dtype, np.floating))]
+    nudges = [NUDGE * np.concatenate([np.zeros((1, *shape)), rng.normal(size=(3, *shape))]) for shape in shapes]
 
     def nudged(parameters: Mapping[str, jax.Array], x: jax.Array, nudges: Sequence[jax.Array]) -> jax.Array:
-        """ψ(x), every number computed on the way being off by a relative error, or nudge."""
-        left = iter(nudges)
+        of_x, *others = nudges
+        left = iter(others)
 
         def step(eqn: core.JaxprEqn, inputs: Sequence[Any]) -> Sequence[Any] | None:
             if eqn.primitive.name in CALLS:
                 return None
-            outputs = inputs if eqn.primitive.name == "stop_gradient" else evaluate(eqn, *inputs)
-            return [out * (1 + next(left)) if jnp.issubdtype(out.dtype, jnp.floating) else out for out in outputs]
+            return [out * (1 + next(left)) if jnp.issubdtype(out.dtype, jnp.floating) else out for out in evaluate(eqn, *inputs)]
 
-        arguments = [*x.reshape(family.arity, family.dimension), *(parameters[key] for key in sorted(parameters))]
-        (value,) = interpret(family.trace, arguments, jnp.asarray, step)
+        x = (x * (1 + of_x)).reshape(family.arity, family.dimension)
+        (value,) = interpret(family.trace, [*x, *(parameters[key] for key in sorted(parameters))], jnp.asarray, step)
         return value.reshape(())
 
-    def sample(parameters: Mapping[str, jax.Array], x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """ψ(x), and what rounding may have done to it, to first order."""
-        value, slopes = jax.value_and_grad(nudged, (1, 2))(parameters, x, [jnp.zeros(aval.shape, aval.dtype) for aval in floats])
-        return value, EPSILON * (jnp.sum(jnp.abs(slopes[0] * x)) + sum(jnp.sum(jnp.abs(slope)) for slope in slopes[1]))
+    compiled = jax.jit(jax.vmap(jax.vmap(nudged, (None, None, 0)), (0, 0, None)))
 
-    def dip(parameters: Mapping[str, jax.Array], x: jax.Array, reach: jax.Array, direction: jax.Array) -> jax.Array:
-        hessian = jax.hessian(lambda x: family.psi(*x.reshape(family.arity, family.dimension), **parameters).reshape(()))(x)
-        steepest = jnp.linalg.eigh(jnp.nan_to_num(hessian))[1][:, -1]
-        steps = reach * jnp.array([0.01, 0.1, 1.0, 10.0])
-        offsets = (jnp.stack([steepest, direction])[:, None, :] * steps[None, :, None]).reshape(-1, x.size)
-        segments = jnp.stack([-offsets, jnp.zeros_like(offsets), offsets])
-        (left, middle, right), noises = jax.vmap(jax.vmap(lambda offset: sample(parameters, x + offset)))(segments)
-        noise = jnp.sum(noises, axis=0)
-        return jnp.any(jnp.isfinite(noise) & ((left + right) / 2 - middle > DOUBT * noise))
+    def evaluated(members: Array, points: Array) -> tuple[Array, Array]:
+        flat, whose = points.reshape(-1, n), np.repeat(members, points[0, ..., 0].size)
+        parts = []
+        for start in range(0, len(flat), BLOCK):  # of one size, so that all is compiled once
+            some = np.arange(start, start + BLOCK) % len(flat)
+            with jax.enable_x64(True):
+                block = compiled({key: value[whose[some]] for key, value in family.parameters.items()}, flat[some], nudges)
+            parts.append(np.asarray(block))
+        values = np.concatenate(parts)[: len(flat)].reshape(*points.shape[:-1], -1)
+        noise = EPSILON * (np.abs(values[..., :1]) + np.abs(values[..., 1:] - values[..., :1]) / NUDGE).max(-1)
+        return values[..., 0], noise
 
-    return dip
+    return evaluated
 
 
 def _computed(trace: core.ClosedJaxpr) -> list[Any]:

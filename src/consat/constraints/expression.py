@@ -11,9 +11,9 @@ of vectors      ``norm2(v)`` = ‖v‖², ``norm(v)`` = ‖v‖ (gradient 0 at 0
 of numbers      ``sqrt exp log sin cos tan asin acos atan sinh cosh tanh square``, ``atan2(y, x)``
 ==============  ===========================================================================================================
 
-The value is a number, positive where the constraint holds, and reads at least one agent. Everything here is continuously differentiable
-inside its domain; hence no ``abs``, ``min``, ``max`` and comparisons. Functions and ``pi`` win over agents with the same id, which the
-quoted form reaches.
+The value is a number, positive where the constraint holds, and reads at least one agent. Everything here, but ``norm`` at 0, is
+continuously differentiable inside its domain; hence no ``abs``, ``min``, ``max`` and comparisons. Functions and ``pi`` win over agents
+with the same id, which the quoted form reaches.
 
 Nothing is ever executed: Python's parser yields a tree, `_Translator` admits what is listed above and refuses the rest, and `Formula`
 evaluates the outcome with `jax.numpy`. Literals are folded and then taken out of the tree, so that constraints with different
@@ -65,7 +65,7 @@ class _Operation(NamedTuple):
     """
 
     takes: str
-    apply: Callable[..., Any]
+    apply: Callable[..., Array]
     fold: Callable[..., Any] | None = None
     wrong: str = ""
 

@@ -3,12 +3,20 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from consat.protocols.base import Flow, Local, State
+from consat.protocols.admm import Admm
+from consat.protocols.base import Flow, Links, Local, Rounds, Solver, State
 from consat.protocols.gradient_flow import GradientFlow
 from consat.protocols.proportional_integral import ProportionalIntegral
+from consat.protocols.proximal import Proximal
 from consat.protocols.selfish import Selfish
 
 FLOWS: Final[Mapping[str, Callable[[], Flow]]] = {flow.name: flow for flow in (GradientFlow, ProportionalIntegral, Selfish)}
-"""What ``--protocol`` may say."""
+"""What ``--protocol`` may say of continuous time."""
 
-__all__ = ["FLOWS", "Flow", "GradientFlow", "Local", "ProportionalIntegral", "Selfish", "State"]
+ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {rounds.name: rounds for rounds in (Admm, Proximal)}
+"""What ``--protocol`` may say of rounds."""
+
+__all__ = [
+    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Links", "Local", "ProportionalIntegral", "Proximal", "Rounds", "Selfish", "Solver",
+    "State",
+]  # fmt: skip

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
+from consat.prox import Memory
+
 
 class State(NamedTuple):
-    """What an agent remembers.
+    """What an agent remembers in continuous time.
 
     Attributes:
         x: (rows, d) its estimates of the positions it holds, its own among them.
@@ -24,7 +26,7 @@ class State(NamedTuple):
 
 
 class Local(Protocol):
-    """What an agent can ask of itself."""
+    """What an agent can ask of itself in continuous time."""
 
     @property
     def own(self) -> Array:
@@ -63,5 +65,92 @@ class Flow(Protocol):
             state: own.
             local: own constraints.
             disagreement: Σ_j (m_i − m_j) over the neighbours, for every array of the message.
+        """
+        ...
+
+
+class Links(Protocol):
+    """An agent's own ends of its links: one for each copy that it shares with a neighbour."""
+
+    @property
+    def degree(self) -> Array:
+        """(rows,) how many links share each copy."""
+        ...
+
+    @property
+    def metropolis(self) -> Array:
+        """(links,) weight of each link, 1/(1 + the larger degree of its two ends), for which neighbours tell each other their degrees."""
+        ...
+
+    def at(self, rows: Array) -> Array:
+        """(rows, …) → (links, …): to each link the value of its copy."""
+        ...
+
+    def sum(self, links: Array) -> Array:
+        """(links, …) → (rows, …): the sum over the links of each copy."""
+        ...
+
+
+class Solver(Protocol):
+    """What an agent can ask of itself in rounds."""
+
+    @property
+    def links(self) -> Links:
+        """Its ends of its links."""
+        ...
+
+    @property
+    def length(self) -> Array:
+        """The team's unit of length, common knowledge: the scenario's scale."""
+        ...
+
+    def recall(self, x: Array, kappa: Array) -> Memory:
+        """What its solver remembers before the first step from x, (rows, d), at weights κ, (rows,)."""
+        ...
+
+    def prox(
+        self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[Array, Memory, Array]:
+        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖², with ν multiplied by `sharper` and f_i = e^{−ν_β (α_i − above)} / `sharper`.
+
+        Returns:
+            (rows, d) the solution, the solver's memory, and (rows,) the mean diagonal of ∇²f_i, NaN where no constraint reads a row.
+        """
+        ...
+
+    def margin(self, x: Array) -> Array:
+        """ᾱ_i at its estimates, one number an agent; +∞ without constraints."""
+        ...
+
+
+class Rounds(Protocol):
+    """A protocol in rounds. In each, an agent speaks once, then hears what arrives."""
+
+    @property
+    def per(self) -> Any:
+        """For each field of the state, what it has one of: ``row``, ``link`` or ``agent``."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """What ``--protocol`` calls it."""
+        ...
+
+    def start(self, x: Array, solver: Solver) -> Any:
+        """The state with which an agent begins from first estimates x; its field ``x`` holds its estimates from then on."""
+        ...
+
+    def speak(self, state: Any, solver: Solver, round_: Array) -> tuple[Any, Any]:
+        """Its step, and its message: arrays with one row a link."""
+        ...
+
+    def hear(self, state: Any, message: Any, arrived: Array, solver: Solver) -> Any:
+        """Take in what came.
+
+        Args:
+            state: own.
+            message: as the other ends sent it.
+            arrived: (links,) whether it did; where not, the message holds nothing of use.
+            solver: own.
         """
         ...

@@ -7,6 +7,7 @@ and a hostile file is refused before it takes time or memory. Anchors and aliase
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -134,9 +135,9 @@ def decode(content: bytes, file: str) -> str:
         message = f"the file is larger than {LARGEST // 2**20} MB; no scenario needs that"
         raise Document(file).broken(message, Place(1, 1, file))
     try:
-        return content.decode("utf-8-sig")
+        return content.removeprefix(BOM_UTF8).decode()
     except UnicodeDecodeError as error:
-        before = content[: error.start].decode("utf-8-sig", "replace")
+        before = content.removeprefix(BOM_UTF8)[: error.start].decode()
         place = Place(before.count("\n") + 1, len(before) - before.rfind("\n"), file)
         raise Document(file).broken("there is a byte that is no UTF-8, but a scenario is text in UTF-8", place) from None
 
@@ -167,9 +168,9 @@ def read(text: str, file: str, place: Callable[[StreamMark], Place] | None = Non
             marks.reverse()  # what is never closed is found where it is opened
         at = where(marks[0] or marks[1] or reader.mark)
         raise document.broken(_in_plain_words(str(error.problem)), at) from None
+    except InvalidScenario:
+        raise
     except (YAMLError, ArithmeticError, ValueError) as error:  # an escape such as "\UFFFFFFFF" slips through as one of the latter
-        if isinstance(error, InvalidScenario):
-            raise
         raise document.broken(_in_plain_words(str(error)), where(reader.mark)) from None
     return document
 

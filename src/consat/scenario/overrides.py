@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from consat.errors import Fault, InvalidScenario, Place, closest, dotted, shown
 from consat.scenario.document import Document, Node, Path, read
 
@@ -26,7 +28,7 @@ def override(document: Document, text: str) -> None:
     except InvalidScenario as error:
         document.faults += error.faults
         return
-    document.faults += new.faults
+    document.faults += [replace(fault, path=()) for fault in new.faults]  # their paths begin at the value
     node = new.root or Node(None, place)
     node.place = node.key = place
     document.root = document.root or Node({}, place)

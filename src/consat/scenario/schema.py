@@ -137,22 +137,23 @@ def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
     where = f"agents[{path[-1]}]"
     if not isinstance(data, dict):
         faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{id: a1, constraints: [..]}}", where)
-        return Agent(data if isinstance(data, str) else where)
+        return Agent(data if isinstance(data, str) else "")
     data = faults.keys(path, data, AGENT_KEYS, where)
     if "id" not in data:
         faults.add((*path, "id"), "id is missing; every agent needs one, such as a1", where)
-    name = data.get("id", where)
+    name = data.get("id", "")
+    where = f"agent {name!r}" if isinstance(name, str) and name.strip() else where
     constraints = data.get("constraints", [])
     if not isinstance(constraints, list):
-        faults.add((*path, "constraints"), f"constraints is {shown(constraints)}, but must be a list of mappings", f"agent {name!r}")
+        faults.add((*path, "constraints"), f"constraints is {shown(constraints)}, but must be a list of mappings", where)
         constraints = []
-    made = [_constraint(item, (*path, "constraints", k), name, faults) for k, item in enumerate(constraints)]
+    made = [_constraint(item, (*path, "constraints", k), where, faults) for k, item in enumerate(constraints)]
     return Agent(name, made, data.get("start"))
 
 
-def _constraint(data: Any, path: Path, owner: Any, faults: _Faults) -> Any:
+def _constraint(data: Any, path: Path, owner: str, faults: _Faults) -> Any:
     """The constraint, or constraints; an empty list if the faults leave nothing to check."""
-    where = f"agent {owner!r}, constraint {int(path[-1]) + 1}"
+    where = f"{owner}, constraint {int(path[-1]) + 1}"
     if not isinstance(data, dict):
         faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{kind: within, center: [2, 0], radius: 1}}", where)
         return []
@@ -164,7 +165,7 @@ def _constraint(data: Any, path: Path, owner: Any, faults: _Faults) -> Any:
         faults.add((*path, "kind"), f"there is no kind {shown(kind)}; the kinds are {', '.join(KINDS)}{closest(kind, KINDS)}", where)
         return []
     name = data.get("name")
-    where = f"agent {owner!r}, constraint {name if isinstance(name, str) else kind!r}"
+    where = f"{owner}, constraint {name if isinstance(name, str) else kind!r}"
     keys = _keys(kind)
     data = faults.keys(path, data, ("kind", *keys), where)
     needed = [key for key, parameter in keys.items() if parameter.default is parameter.empty]

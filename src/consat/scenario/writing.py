@@ -23,7 +23,7 @@ from consat.team import TOPOLOGIES, Family, Team, topology
 WIDTH: Final = 110
 """Lists and mappings up to this many characters stand on one line."""
 
-_WORD = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
+_WORDS = re.compile(r"[A-Za-z][\w-]*( [\w-]+)*", re.ASCII)
 _UNPRINTED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
 
 
@@ -133,7 +133,7 @@ def _flow(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_flow, value)) + "]"
     if isinstance(value, str):
-        if _WORD.fullmatch(value) and resolve(value) == value:
+        if _WORDS.fullmatch(value) and resolve(value) == value:
             return value
         return _UNPRINTED.sub(lambda odd: f"\\u{ord(odd[0]):04x}", json.dumps(value, ensure_ascii=False))
     return str(int(value)) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else json.dumps(value)

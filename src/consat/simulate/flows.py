@@ -1,11 +1,11 @@
-"""The whole team in one process: the protocol's per-agent functions over all agents' copies at once."""
+"""Protocols in continuous time, integrated by diffrax."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,10 @@ import numpy as np
 from jax import Array
 
 from consat.estimates import Estimates, Exchange
-from consat.numerics import CompileClock, float64
+from consat.numerics import CompileClock, float64, quick_compilation
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import Flow, State
+from consat.simulate import Stop
 from consat.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
@@ -36,7 +37,7 @@ MOST_STEPS = 100_000
 MOST_NUMBERS = 1000
 """Estimates and integral states are recorded by default while there are at most this many numbers in each."""
 
-Stop = Literal["satisfied", "converged", "never"]
+
 
 
 @jax.tree_util.register_dataclass
@@ -127,9 +128,7 @@ def _advance() -> Callable[[Flow, Problem, State, Array], tuple[State, Array]]:
         )
         return solution.ys, solution.result == diffrax.RESULTS.successful
 
-    # halves the compilation and costs nothing measurable at run time
-    options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
-    return jax.jit(advance, static_argnames=("flow",), compiler_options=options)
+    return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
 
 
 @functools.partial(jax.jit, static_argnames=("flow",))

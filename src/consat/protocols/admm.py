@@ -1,0 +1,92 @@
+"""Relaxed ADMM over local estimates (Bastianello, Carli, Schenato, Todescato, arXiv 1901.09252). For each link and shared copy agent i
+keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
+
+    x_i⁺ = argmin_y f_i(y) + Σ_j ρ_ij/2 ‖y − u_ij‖²
+    send   q_ij = 2 x_i⁺ − u_ij
+    on receipt of q_ji:   u_ij ← (1 − a) u_ij + a q_ji             a lost message leaves u_ij as it was
+
+It converges under random loss and wake-ups from any u: there is no invariant to lose. The penalty of a link is the geometric mean of what
+its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest, and then each end moves
+ρ_i, slowly at first, towards the stiffness of its own f_i, where the optimum is reached soonest; a copy that no constraint of its holder
+reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from consat.protocols.base import Solver
+from consat.prox import Memory
+
+
+class AdmmState(NamedTuple):
+    """What an agent remembers.
+
+    Attributes:
+        x: (rows, d) estimates.
+        u: (links, d) the points of its links.
+        wish: (rows,) ln ρ_i.
+        heard: (links,) ln ρ_j, as last received.
+        penalty: (links,) ln ρ_ij in force.
+        memory: of its solver.
+    """
+
+    x: Array
+    u: Array
+    wish: Array
+    heard: Array
+    penalty: Array
+    memory: Memory
+
+
+@dataclass(frozen=True)
+class Admm:
+    """See the module.
+
+    Attributes:
+        relaxation: a in (0, 1); above 1/2 is over-relaxed.
+        penalty: ρ at the start, in 1/length².
+        share: of the stiffness, that ρ_i moves towards.
+        pace: how far ln ρ_i may move in the first round, and …
+        quickening: … how much farther in each one after.
+        horizon: round after which the moves die out, so that ρ settles and convergence is that of fixed ρ.
+    """
+
+    relaxation: float = 0.7
+    penalty: float = 10.0
+    share: float = 0.3
+    pace: float = 0.05
+    quickening: float = 0.002
+    horizon: float = 150.0
+    name = "admm"
+    per = AdmmState(x="row", u="link", wish="row", heard="link", penalty="link", memory="agent")
+
+    def start(self, x: Array, solver: Solver) -> AdmmState:
+        at_links = solver.links.at(x)
+        wish = jnp.zeros(len(x)) + jnp.log(self.penalty / solver.length**2)
+        level = solver.links.at(wish)
+        return AdmmState(x, at_links, wish, level, level, solver.recall(x, jnp.exp(wish)))
+
+    def speak(self, state: AdmmState, solver: Solver, round_: Array) -> tuple[AdmmState, tuple[Array, Array]]:
+        links = solver.links
+        x, u, wish = state.x, state.u, state.wish
+        penalty = 0.5 * (links.at(wish) + state.heard)
+        u = links.at(x) + (u - links.at(x)) * jnp.exp(state.penalty - penalty)[:, None]
+        rho = jnp.exp(penalty)
+        kappa, linked = links.sum(rho), links.degree > 0
+        v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
+        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory)
+        neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
+        goal = jnp.where(jnp.isnan(stiffness), neighbours, jnp.log(self.share * stiffness + jnp.finfo(x.dtype).tiny))
+        most = (self.pace + self.quickening * round_) / (1.0 + (round_ / self.horizon) ** 4)
+        wish = wish + jnp.clip(goal - wish, -most, most)
+        return AdmmState(x, u, wish, state.heard, penalty, memory), (2 * links.at(x) - u, links.at(wish))
+
+    def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:  # noqa: ARG002
+        q, wish = message
+        u = jnp.where(arrived[:, None], (1 - self.relaxation) * state.u + self.relaxation * q, state.u)
+        return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))

@@ -1,0 +1,64 @@
+"""P-EXTRA, the gradient flow with its stiff part taken implicitly (Shi, Ling, Wu, Yin 2015): in each round, with Metropolis weights w,
+
+    v  = x − Σ_j w_ij (x − x_j) − z
+    z⁺ = z + ½ Σ_j w_ij (x − x_j),          z(0) = 0
+    x⁺ = argmin_y f_i(y) + ‖y − v‖²/(2c)
+
+Sends x. It converges for every c > 0 when the ψ are concave, on links that lose nothing: a lost message makes the two ends of a link
+integrate different differences, so that Σ z drifts. `consat.protocols.admm` is its twin for links that do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from consat.protocols.base import Solver
+from consat.prox import Memory
+
+
+class ProximalState(NamedTuple):
+    """What an agent remembers.
+
+    Attributes:
+        x: (rows, d) estimates.
+        z: (rows, d) integral of the disagreement.
+        heard: (links, d) the neighbours' estimates, as last received.
+        memory: of its solver.
+    """
+
+    x: Array
+    z: Array
+    heard: Array
+    memory: Memory
+
+
+@dataclass(frozen=True)
+class Proximal:
+    """See the module.
+
+    Attributes:
+        step: c, in length².
+    """
+
+    step: float = 0.3
+    name = "proximal"
+    per = ProximalState(x="row", z="row", heard="link", memory="agent")
+
+    def start(self, x: Array, solver: Solver) -> ProximalState:
+        return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
+
+    def speak(self, state: ProximalState, solver: Solver, round_: Array) -> tuple[ProximalState, Array]:  # noqa: ARG002
+        links = solver.links
+        spread = links.sum(links.metropolis[:, None] * (links.at(state.x) - state.heard))
+        x, memory, _ = solver.prox(state.x - spread - state.z, self._kappa(state.x, solver), state.x, state.memory)
+        return ProximalState(x, state.z + 0.5 * spread, state.heard, memory), links.at(x)
+
+    def _kappa(self, x: Array, solver: Solver) -> Array:
+        return jnp.zeros(len(x)) + 1.0 / (self.step * solver.length**2)
+
+    def hear(self, state: ProximalState, message: Array, arrived: Array, solver: Solver) -> ProximalState:  # noqa: ARG002
+        return state._replace(heard=jnp.where(arrived[:, None], message, state.heard))

@@ -1,0 +1,285 @@
+"""The figures of a run, as the paper shows it: formation, margins, estimates, integral states.
+
+Regions are drawn for any ψ alike, library kind, expression or own function: ψ is evaluated with its owner moved over a grid
+and everyone else where they are, so its line is where the constraint starts to hold for its owner, as the others stand.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jax import Array
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from consat.numerics import float64
+from consat.result import Result
+from consat.team import Team
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which the colour-blind can tell apart, without the yellow, which nobody sees on white."""
+MARKERS = ("o", "s", "^", "D", "v", "<", ">")
+STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
+GREY = "0.45"
+DPI = 150
+BATCH = 8192
+FAR = 6.0
+"""Paths that would make the view this many times wider are cut, so that the formation stays visible."""
+MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 1200, 12, 60
+
+
+def colour(agent: int) -> str:
+    """The colour of an agent, the same in every figure."""
+    return COLOURS[agent % len(COLOURS)]
+
+
+def marker(agent: int) -> str:
+    """The marker of an agent; where the colours repeat, the markers differ."""
+    return MARKERS[(agent + agent // len(COLOURS)) % len(MARKERS)]
+
+
+def plain(text: str, longest: int = 34) -> str:
+    """A name as matplotlib should show it: dollars are no mathematics, a leading underscore doesn't hide it from a legend."""
+    short = text if len(text) <= longest else text[: longest - 1] + "…"
+    return (" " if short.startswith("_") else "") + short.replace("$", r"\$")
+
+
+@functools.partial(jax.jit, static_argnames="psi")
+def _over(psi: Callable[..., Any], points: Array, arguments: Array, slot: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
+    def at(point: Array, arguments: Array, slot: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
+        return weight * psi(*arguments.at[slot, : len(point)].set(point), **parameters)
+
+    return jax.vmap(jax.vmap(at, (0, None, None, None, None)), (None, 0, 0, 0, 0))(points, arguments, slot, parameters, weight)
+
+
+@float64
+def regions(team: Team, x: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How well each constraint holds for its owner at other places, as the others stand.
+
+    Args:
+        team: the team.
+        x: (N, d) everyone's positions.
+        points: (K, p) where to put the owner instead, on its first p ≤ d axes.
+
+    Returns:
+        (M, K) the weighted ψ of every constraint, in the team's order; NaN where it is not finite.
+    """
+    count = len(points)
+    batches = np.resize(points, (-(-count // BATCH), BATCH, points.shape[1]))  # all of one size, so that ψ is compiled once
+    values = np.empty((len(team.owner), batches.shape[0] * BATCH))
+    for family in team.families:
+        slot = jnp.asarray(np.argmax(family.agents == family.owner[:, None], axis=1))
+        parameters = {key: jnp.asarray(value) for key, value in family.parameters.items()}
+        arguments, weight = jnp.asarray(x[family.agents], dtype=float), jnp.asarray(family.weight)
+        for k, batch in enumerate(batches):
+            at = slice(k * BATCH, (k + 1) * BATCH)
+            values[family.number, at] = _over(family.psi, jnp.asarray(batch), arguments, slot, parameters, weight)
+    return np.where(np.isfinite(values), values, np.nan)[:, :count]
+
+
+def grid(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(p, count) coordinates along each axis of a box, and the (count^p, p) points of the grid they make."""
+    along = np.linspace(low, high, count, axis=-1)
+    return along, np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(low))
+
+
+def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Number and box, (2, p), of every region, or obstacle, that lies within a box."""
+    count = {1: 401, 2: 81, 3: 31}[len(low)]
+    along, points = grid(low, high, count)
+    for k, values in enumerate(regions(team, x, points).reshape(-1, *(count,) * len(low))):
+        for places in (np.argwhere(values > 0), np.argwhere(values < 0)):
+            if len(places) and places.min() > 0 and places.max() < count - 1:
+                ends = np.stack([places.min(axis=0) - 1, places.max(axis=0) + 1])
+                yield k, np.take_along_axis(along, ends.T, axis=1).T
+
+
+def view(paths: np.ndarray, x: np.ndarray, team: Team | None) -> tuple[np.ndarray, np.ndarray, bool]:
+    """The box to show, low and high, of the paths (T, N, p) to a formation at x (N, d), and whether it leaves starts out.
+
+    It holds the formation, its regions, and the paths unless they come from far.
+    """
+    everywhere, core = paths.reshape(-1, paths.shape[2]), paths[-1]
+    middle = (core.min(axis=0) + core.max(axis=0)) / 2
+    half = max(float(np.ptp(core, axis=0).max()), 1e-3 * float(np.ptp(everywhere, axis=0).max())) or 1e-3
+    count = 0 if team is None else len(team.owner)
+    missing = set(range(count))
+    for factor in 4.0 ** np.arange(12):  # ever wider, until every region has been seen
+        for k, box in _sights(team, x, middle - factor * half, middle + factor * half) if team is not None and missing else ():
+            if k in missing and (len(missing) == count or np.ptp(box, axis=0).max() <= FAR * np.ptp(core, axis=0).max()):
+                core = np.concatenate([core, box])
+                missing.discard(k)
+    both = np.concatenate([core, everywhere])
+    cut = bool(np.ptp(both, axis=0).max() > FAR * np.ptp(core, axis=0).max() > 0)
+    low, high = (core if cut else both).min(axis=0), (core if cut else both).max(axis=0)
+    side = float((high - low).max()) or 1.0
+    spare = np.maximum(0.0, 0.75 * side - (high - low)) / 2 + (0.35 if cut else 0.08) * side
+    return low - spare, high + spare, cut
+
+
+def formation(result: Result, axes: Any = None) -> Figure:
+    """Paths from start (open) to end (filled), and where each constraint holds for its owner, as the others stand in the end.
+
+    Args:
+        result: of a run.
+        axes: what to draw on, 3-D axes for a team in space; if None, a new figure.
+    """
+    from consat.views.animation import Scene  # a still is the last moment of a film
+
+    scene = Scene(result, axes)
+    scene.show(scene.last)
+    figure: Figure = scene.figure
+    return figure
+
+
+def margins(result: Result) -> Figure:
+    """The margin β̄ and the smooth margin β, from when on every constraint holds, and between what the best margin is proven to lie."""
+    data, summary = result.data, result.summary
+    figure, axes, clock = _chart(result, "margin of the team", "margin")
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    for name, label, k in (("margin", r"margin $\barβ$", 0), ("smooth_margin", r"smooth margin $β$", 1)):
+        curve = data[name].where(np.isfinite(data[name]))
+        dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
+        axes.plot(data[clock], curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
+    axes.margins(y=0.08)
+    _stretch(axes, data["margin"].values, data["smooth_margin"].values)
+    lower, upper = summary.get("bounds") or (None, None)
+    if lower is not None and upper is not None:
+        proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
+        axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
+    since = (summary.get("satisfied_from") or {}).get(clock)
+    if since is not None:
+        axes.axvline(since, color=COLOURS[3], linewidth=1.5, linestyle=":")
+        label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
+        late = since > np.mean(axes.get_xlim())
+        axes.text(since, 0.06, f" {label} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _chart(result: Result, title: str, ylabel: str) -> tuple[Figure, Axes, str]:
+    """A figure, its axes over the time, or the rounds, of a run, and which of the two."""
+    figure = Figure(figsize=(8.4, 4.8), layout="constrained")
+    axes = figure.add_subplot(title=f"{plain(result.summary['scenario'])}: {title}", ylabel=ylabel)
+    clock = str(result.data["margin"].dims[0])
+    first, last = result.data[clock].values[[0, -1]]
+    axes.set(xlabel="time t [s]" if clock == "time" else "round", xlim=(first, last if last > first else first + 1))
+    axes.grid(color="0.92", linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes, clock
+
+
+def _stretch(axes: Axes, *curves: np.ndarray) -> None:
+    """A scale that shows the end of the run beside a beginning many times larger: linear around zero, logarithmic beyond."""
+    finite = [np.abs(curve[np.isfinite(curve)]) for curve in curves]
+    largest = max((float(curve.max()) for curve in finite if len(curve)), default=0.0)
+    end = max((float(curve[-1]) for curve in finite if len(curve)), default=0.0)
+    if largest <= 10 * end or not largest:
+        return
+    decade = math.floor(math.log10(1.2 * max(end, 1e-4 * largest)))
+    axes.set_yscale("asinh", linear_width=10.0**decade / 3)
+    limits = axes.get_ylim()
+    decades = 10.0 ** np.arange(decade, math.ceil(math.log10(largest)) + 1)
+    axes.set_yticks([*-decades[::-1], 0.0, *decades], minor=False)
+    axes.set_yticks(np.outer([*-decades, *decades], range(2, 10)).ravel(), minor=True)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
+    axes.set_ylim(limits)
+
+
+def number(value: float) -> str:
+    """A number for people: three digits, or the whole ones of thousands, and a real minus."""
+    return (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
+
+
+def estimates(result: Result) -> Figure | None:
+    """What the agents think where everyone is: a colour for each coordinate, a line style for each holder; None if it was not recorded."""
+    return _copies(result, "estimate", "estimates of the positions", "estimate [length]")
+
+
+def integrals(result: Result) -> Figure | None:
+    """The integral states, encoded as the estimates; None if they were not recorded."""
+    return _copies(result, "integral", "integral states", "integral state z")
+
+
+def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None:
+    data = result.data
+    if name not in data:
+        return None
+    ids, names = ([str(value) for value in data[key].values] for key in ("agent", "axis"))
+    index = {agent: i for i, agent in enumerate(ids)}
+    count, dimension = data[name].shape[1:]
+    shades = _shades(len(ids), dimension)
+    chosen = _sample(count, max(1, MOST_CURVES // dimension))
+    figure, axes, clock = _chart(result, title + (f", {len(chosen)} of {count} copies" if len(chosen) < count else ""), ylabel)
+    for copy in chosen:
+        holder, held = (index[str(data[key].values[copy])] for key in ("holder", "held"))
+        for values, shade in zip(data[name].values[:, copy].T, shades[held], strict=True):
+            axes.plot(data[clock], values, color=shade, linestyle=STYLES[holder % len(STYLES)], linewidth=1.3)
+    entries = [
+        Line2D([], [], color=shades[i, k], linewidth=2.5, label=f"{names[k]} of {plain(ids[i], 14)}")
+        for i, k in (divmod(place, dimension) for place in _sample(len(ids) * dimension, MOST_ENTRIES))
+    ]
+    for agent, style in zip(ids, STYLES, strict=False):
+        entries.append(Line2D([], [], color=GREY, linestyle=style, label=f"held by {plain(agent, 14)}"))
+    if len(ids) > len(STYLES):
+        entries.append(Line2D([], [], linestyle="", label="… and so on, in turn"))
+    axes.legend(handles=entries, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, borderaxespad=0)
+    return figure
+
+
+def _sample(count: int, most: int) -> list[int]:
+    """At most so many of so many places, evenly spread."""
+    return [int(place) for place in np.linspace(0, count - 1, min(count, most))]
+
+
+def _shades(agents: int, dimension: int) -> np.ndarray:
+    """(N, d, 3) a colour for each coordinate: of the agent's colour a shade for each axis; of many agents the whole of a colour map."""
+    if agents > len(COLOURS):
+        return mpl.colormaps["viridis"](np.linspace(0, 0.95, agents * dimension))[:, :3].reshape(agents, dimension, 3)
+    base = np.array([to_rgb(colour(i)) for i in range(agents)])[:, None]
+    white = np.resize([0.0, 0.5, -0.5, 0.75, -0.75], dimension)[:, None]  # negative: black
+    return (1 - np.abs(white)) * base + np.maximum(white, 0.0)
+
+
+def save(result: Result, directory: str | os.PathLike[str]) -> list[Path]:
+    """Write formation.png, margins.png and, where recorded, estimates.png and integrals.png into a directory, made if need be."""
+    target = Path(directory)
+    target.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in _all(result):
+        paths.append(target / f"{name}.png")
+        figure.savefig(paths[-1], dpi=DPI)
+    return paths
+
+
+def show(result: Result) -> list[Path]:
+    """Show the figures in windows, or in the notebook, and wait until they are closed; there are no files, so the list is empty."""
+    from matplotlib import pyplot
+    from matplotlib.backends.registry import BackendFilter, backend_registry
+
+    if mpl.get_backend().lower() in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
+        logging.getLogger(__name__).warning("there is no display to show figures on; result.plot('figures') writes them into a directory")
+        return []
+    for _, figure in _all(result):
+        pyplot.figure(figure)
+    pyplot.show()
+    return []
+
+
+def _all(result: Result) -> Iterator[tuple[str, Figure]]:
+    for draw in (formation, margins, estimates, integrals):
+        figure = draw(result)
+        if figure is not None:
+            yield draw.__name__, figure

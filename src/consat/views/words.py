@@ -1,0 +1,115 @@
+"""A run in words: what ``print(result)`` shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+MOST_AGENTS = 10
+"""Of how many agents every position is listed; of more, only those with the smallest margins are named."""
+MOST_BINDING, MOST_AXES, MOST_LETTERS = 5, 6, 24
+SLIGHT = 0.01
+"""Constraints with a smaller multiplier don't bind."""
+
+STATUS = {
+    "satisfied": "every constraint holds",
+    "least-violating": "the constraints cannot all hold; this formation violates them about as little as possible",
+    "not-converged": "not every constraint holds",
+    "diverged": "the run diverged",
+}
+ENDING = {
+    "settled": "the team has settled",
+    "out of time": "the run ended when its time was up",
+    "too stiff": "the run ended early, since the flow became too stiff",
+    "interrupted": "the run was interrupted",
+}
+VERDICT = {
+    "feasible": "feasible: the constraints can all hold",
+    "infeasible": "infeasible: proven, the constraints cannot all hold",
+    "undecided": "undecided: whether the constraints can all hold is open",
+}
+
+
+def summary(summary: Mapping[str, Any]) -> str:
+    """A summary, as ``consat run --json`` prints it, as text for people."""
+    status, ending = STATUS[summary["status"]], ENDING.get(summary.get("ending", ""))
+    lines = [f"{summary['scenario']}: {status}" + (f"; {ending}" if ending and summary["status"] != "diverged" else "")]
+    for name, value in (*_outcome(summary), *_effort(summary), *_who(summary)):
+        lines.append(f"  {name:<16}{value}")
+    return "\n".join(lines)
+
+
+def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "verdict", VERDICT[summary["verdict"]]
+    yield "margin", f"{_number(summary['margin'])} (smooth margin {_number(summary['smooth_margin'])})"
+    lower, upper = summary.get("bounds") or (None, None)
+    if lower is not None and upper is not None:
+        yield "best possible", f"between {_number(lower)} and {_number(upper)}, proven"
+    since = summary["satisfied_from"]
+    if since["time"] is not None:
+        yield "satisfied from", f"t = {_number(since['time'])} s"
+    elif since["round"] is not None:
+        yield "satisfied from", f"round {since['round']:.0f}"
+    else:
+        yield "satisfied from", "not at the end of the run"
+
+
+def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
+    counted = [f"{summary[key]:,} {unit}" for key, unit in (("rounds", "rounds"), ("messages", "messages"), ("floats_sent", "numbers sent"))
+               if summary.get(key) is not None]  # fmt: skip
+    if summary.get("time") is not None:
+        counted.insert(0, f"until t = {_number(summary['time'])} s")
+    if counted:
+        yield "effort", ", ".join(counted)
+
+
+def _who(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Which constraints bind, and where the agents are."""
+    agents, positions = summary.get("agents"), summary.get("positions")
+    if agents is None or positions is None:
+        yield "agents", f"{summary['count']:,}, too many to list"
+        return
+    pulls = [
+        (constraint["multiplier"], f"{_short(agent)}: {_short(constraint['name'])}")
+        for agent, entry in agents.items()
+        for constraint in entry["constraints"]
+        if (constraint["multiplier"] or 0.0) >= SLIGHT
+    ]
+    pulls.sort(key=lambda pull: -pull[0])
+    if pulls and summary["status"] != "diverged":
+        more = f", and {len(pulls) - MOST_BINDING} more" if len(pulls) > MOST_BINDING else ""
+        yield "binding", ", ".join(f"{name} {multiplier:.2f}" for multiplier, name in pulls[:MOST_BINDING]) + more
+    if len(agents) > MOST_AGENTS:
+        margins = sorted((entry["margin"], agent) for agent, entry in agents.items() if entry["margin"] is not None)
+        yield (
+            "agents",
+            f"{len(agents):,}; the tightest: " + ", ".join(f"{_short(agent)} ({_number(margin)})" for margin, agent in margins[:3]),
+        )
+        return
+    width = max(len(_short(agent)) for agent in agents)
+    places = _places(list(positions.values()))
+    for k, (agent, entry) in enumerate(agents.items()):
+        own = f"margin {_number(entry['margin'])}" if entry["constraints"] else "no constraints"
+        yield "" if k else "positions", f"{_short(agent):<{width}}  {places[k]}  {own}"
+
+
+def _places(positions: Sequence[Sequence[float | None]]) -> list[str]:
+    """Positions in columns, with the digits that the size of the formation deserves."""
+    largest = max((abs(x) for position in positions for x in position if x is not None), default=0.0)
+    if largest and not 1e-3 <= largest < 1e6:
+        texts = [[_number(x) for x in position] for position in positions]
+    else:
+        decimals = 3 - math.floor(math.log10(largest)) if 0 < largest < 1e3 else 0
+        texts = [["none" if x is None else f"{round(x, decimals) + 0.0:.{decimals}f}" for x in position] for position in positions]
+    width = max(len(text) for row in texts for text in row)
+    return ["(" + ", ".join(f"{text:>{width}}" for text in row[:MOST_AXES]) + (", ...)" if len(row) > MOST_AXES else ")") for row in texts]
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4g}"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= MOST_LETTERS else name[: MOST_LETTERS - 3] + "..."
