@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
     from consat.result import Result
-    from consat.runner import run
+    from consat.runner import run, solve
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
     from consat.team import Agent, Team
@@ -24,7 +24,7 @@ _HOME = {
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
     "result": ("Result",),
-    "runner": ("run",),
+    "runner": ("run", "solve"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "team": ("Agent", "Team"),
@@ -34,7 +34,7 @@ _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "Agent", "ConsatError", "Constraint", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
     "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
-    "expr", "halfspace", "load", "loads", "near", "outside", "run", "within",
+    "expr", "halfspace", "load", "loads", "near", "outside", "run", "solve", "within",
 ]  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def init(name: str | None) -> None:
 @cli.command()
 @scenario_argument
 @set_option
-@click.option("--protocol", metavar="KIND", help="admm (default), proximal, gradient-flow, proportional-integral, selfish.")
+@click.option("--protocol", metavar="KIND", help="admm (default), proximal, max-min, gradient-flow, proportional-integral, selfish.")
 @click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
 @click.option("--rounds", type=click.IntRange(min=0), help="How many rounds; implies --stop never.")
@@ -140,6 +140,25 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     with _located(loaded):
         require_connected(loaded.team)
     return DONE
+
+
+@cli.command()
+@scenario_argument
+@set_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the starts, where there are many.")
+@click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
+@json_option
+def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float | None, as_json: bool) -> int:
+    """Find the best margin centrally, prove it, and say what stands in the way."""
+    _cache_compilations()
+    loaded = _load(scenario, overrides)
+    from consat.runner import solve as solve_team
+    from consat.views import words
+
+    with _located(loaded):
+        answer = solve_team(loaded, seed=seed, auxiliary=auxiliary)
+    click.echo(json.dumps(answer) if as_json else words.solve(answer))
+    return DONE if answer["verdict"] == "feasible" else UNSATISFIED
 
 
 @cli.command()

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import networkx as nx
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from consat.errors import Fault, InvalidTeam
 from consat.team import Team
@@ -69,6 +69,27 @@ def require_connected(team: Team) -> None:
         faults.append(Fault(("communication",), message, "communication"))
     if faults:
         raise InvalidTeam(faults)
+
+
+def hops(count: int, links: np.ndarray) -> int:
+    """How many links a message crosses, at most, between two agents of a component: found by searching from an agent far out, and then from
+    the one farthest from it, which is exact on trees and close elsewhere.
+
+    Args:
+        count: N.
+        links: (L, 2).
+    """
+    graph = coo_array((np.ones(len(links), dtype=np.int8), (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
+    longest, labels = 0, _components(links, count)
+    for first in np.unique(labels, return_index=True)[1]:
+        for _ in range(2):
+            order, parent = breadth_first_order(graph, first, directed=False)
+            depth = np.zeros(count, dtype=np.int64)
+            for agent in order[1:]:
+                depth[agent] = depth[parent[agent]] + 1
+            first = order[np.argmax(depth[order])]
+            longest = max(longest, int(depth[first]))
+    return longest
 
 
 def holders(team: Team, cluster: np.ndarray) -> np.ndarray:

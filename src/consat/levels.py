@@ -1,8 +1,8 @@
 """How far a better formation can lie: radii that turn a leftover gradient into a bound (design, section 6).
 
 Whoever is better than x̂ satisfies ψ_k ≥ L = β̄(x̂) for every k. Constraints on one agent then keep it in a region of its own; constraints
-on the difference of two keep them within reach of each other; so the radius of an agent is a shortest path from the regions along the reaches.
-Affine constraints and supporting planes of concave ones are gathered into polytopes.
+on the difference of two keep them within reach of each other; so the radius of an agent is a shortest path from the regions along the
+reaches. Affine constraints and supporting planes of concave ones are gathered into polytopes.
 """
 
 from __future__ import annotations

@@ -331,7 +331,7 @@ def step(
     Args:
         batches: the agents that have constraints; the rows of the others stay at v.
         nu: the smoothing.
-        offset: added to every ln f_i.
+        offset: added to ln f_i; one number, or one an agent.
         v: (rows, d) the point to stay near.
         kappa: (rows,) how near.
         x: (rows, d) where the last step ended.
@@ -342,15 +342,18 @@ def step(
         (rows, d) the solution, the memory, and (rows,) the stiffness, NaN for rows that no constraint reads.
     """
     near, last, weight = _padded(v), _padded(x), _padded(kappa)
+    offset = jnp.broadcast_to(offset, memory.sigma.shape)
     stiff = jnp.full(len(kappa), jnp.nan)
     for batch in batches:
 
-        def solve_one(kinds: tuple[Kind, ...], rows: Array, sigma: Array, sharpness: Array, batch: Bucket = batch) -> tuple[Guess, Array]:
-            one = _One(batch.psi, kinds, nu, offset)
-            found, bend, _ = solve(one.level, near[rows], weight[rows][:, None], Guess(last[rows], sigma, sharpness), tolerance, batch.convex)
+        def solve_one(
+            kinds: tuple[Kind, ...], rows: Array, remembered: Memory, above: Array, batch: Bucket = batch
+        ) -> tuple[Guess, Array]:
+            one = _One(batch.psi, kinds, nu, above)
+            found, bend, _ = solve(one.level, near[rows], weight[rows][:, None], Guess(last[rows], *remembered), tolerance, batch.convex)
             return found, bend
 
-        found, bend = jax.vmap(solve_one)(batch.kinds, batch.rows, memory.sigma[batch.agents], memory.sharpness[batch.agents])
+        found, bend = jax.vmap(solve_one)(batch.kinds, batch.rows, jax.tree.map(lambda leaf: leaf[batch.agents], memory), offset[batch.agents])
         flat = batch.rows.reshape(-1)
         v = v.at[flat].set(found.y.reshape(-1, v.shape[1]), mode="drop")
         stiff = stiff.at[flat].set(bend.reshape(-1), mode="drop")

@@ -1,8 +1,8 @@
 """Why a team cannot do better, in words: which constraints conflict or bind, and what the least change is that would help.
 
 Multipliers say which constraints fight, and by how much the margin rises as one of them gives way: dβ̄*/dp = λ_k ∂ψ_k/∂p. That is where
-to look, not what is said: a conflict is stated only if the constraints named, on their own, are proven incompatible, and a cure only if the team
-with that change, solved again, satisfies every constraint of the cluster.
+to look, not what is said: a conflict is stated only if the constraints named, on their own, are proven incompatible, and a cure only if the
+team with that change, solved again, satisfies every constraint of the cluster.
 """
 
 from __future__ import annotations

@@ -13,13 +13,15 @@ import numpy as np
 
 from consat import __version__
 from consat.assumptions import with_auxiliary
-from consat.certificate import bounds
+from consat.certificate import BINDING, bounds
 from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import FLOWS, ROUNDS
 from consat.quadratics import shape_of
+from consat.reasons import explain
+from consat.reference import max_min
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
@@ -32,8 +34,11 @@ from consat.trace import Trace
 
 DEFAULT_PROTOCOL = "admm"
 SCHEMA = "consat.run/1"
+SOLVE_SCHEMA = "consat.solve/1"
 MOST_LISTED = 10_000
 """Above this many agents the summary leaves out what it says of each."""
+SHARP = 2e-4
+"""Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
 AT_REST = 1e-2
 """A team whose last positions moved by less than this, in its units of length, counts as arrived."""
 
@@ -103,7 +108,7 @@ def run(
     kind = settings.protocol.kind
     if kind not in FLOWS and kind not in ROUNDS:
         raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
-    stop = stop or ("satisfied" if until is None and rounds is None else "never")
+    stop = stop or ("never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied")
     if kind in FLOWS:
         _refuse(kind, "flows in continuous time; give until, or choose a protocol in rounds", rounds=rounds, loss=loss, sleep=sleep, rate=rate)
         return _run(scenario, settings, full, lambda *given: _flow(*given, settings, until, stop, record, progress))
@@ -152,8 +157,50 @@ def _rounds(
     return simulate_rounds(
         team, protocol, copies, schedule.final, size.length, first, convex=bool(shape_of(team).concave.all()), rounds=rounds, stop=stop,
         weather=weather, body=body, record=record, progress=progress,
-        proven=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
+        hopeless=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
+        enough=(lambda position: _gap(team, position) <= SHARP * size.psi) if protocol.name == "max-min" else None,
     )  # fmt: skip
+
+
+def _gap(team: Team, position: np.ndarray) -> float:
+    """How much better than this, at most, another formation could be."""
+    certificate = bounds(team, position)
+    return np.inf if certificate.upper is None else certificate.upper - certificate.lower
+
+
+@float64
+def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> dict[str, Any]:
+    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.reference.max_min`.
+
+    Args:
+        team: as in `run`.
+        seed: of the starts, where there are many.
+        auxiliary: as in `run`.
+
+    Returns:
+        what ``consat solve --json`` prints (schema consat.solve/1), and ``reasons``: what binds or conflicts, in words.
+    """
+    scenario = _scenario(team)
+    if auxiliary is not None:
+        scenario = dataclasses.replace(scenario, team=with_auxiliary(scenario.team, auxiliary))
+    problem = scenario.team
+    optimum = max_min(problem, seed=seed)
+    certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
+    return {
+        "schema": SOLVE_SCHEMA,
+        "scenario": scenario.name,
+        "margin": _number(optimum.margin),
+        "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
+        "verdict": certificate.verdict,
+        "positions": {agent: [_number(x) for x in row] for agent, row in zip(problem.ids, optimum.positions, strict=True)},
+        "binding": [
+            {"agent": problem.ids[problem.owner[k]], "constraint": problem.names[k], "multiplier": float(optimum.multipliers[k])}
+            for k in np.argsort(-optimum.multipliers, kind="stable")
+            if optimum.multipliers[k] > BINDING
+        ],
+        "method": optimum.method,
+        "reasons": explain(problem, optimum),
+    }
 
 
 def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Any
 
@@ -412,9 +412,11 @@ class Jet:
 
     def of_number(self, h: Any, slope: Any, bend: Any) -> "Jet":
         outer = self.gradient[:, :, None] * self.gradient[:, None, :]
-        hessian = bend[:, None, None] * outer + slope[:, None, None] * self.hessian
-        scale = np.abs(bend) * np.abs(outer).max((-1, -2)) + np.abs(slope) * self.size
-        return Jet(h, slope[:, None] * self.gradient, hessian, np.maximum(scale, self.size))
+        slope, bend = slope[:, None, None], bend[:, None, None]
+        parts = np.where(outer == 0, 0, bend * outer), np.where(self.hessian == 0, 0, slope * self.hessian)  # 0 also where h has no slope
+        sizes = np.abs(parts[0]).max((1, 2)), np.where(self.size == 0, 0, np.abs(slope[:, 0, 0]) * self.size), self.size
+        gradient = np.where(self.gradient == 0, 0, slope[:, 0] * self.gradient)
+        return Jet(h, gradient, parts[0] + parts[1], np.maximum.reduce(sizes))
 
     def __add__(self, other: "Jet") -> "Jet":
         return Jet.of(self.value + other.value, self.gradient + other.gradient, self.hessian + other.hessian, self, other)
@@ -482,6 +484,12 @@ def _jet_extreme(jets: Sequence[Jet], above: bool) -> Jet:
     return reduce(lambda u, v: u.where(np.isnan(u.value) | (((u.value > v.value) == above) & ~np.isnan(v.value)), v), jets)
 
 
+def _jet_logsumexp(jets: Sequence[Jet]) -> Jet:
+    top = np.maximum.reduce([jet.value for jet in jets])
+    shifted = _JET_LOG(_jet_sum([_JET_EXP(replace(jet, value=jet.value - top)) for jet in jets]))
+    return replace(shifted, value=shifted.value + top)
+
+
 OF_MANY: dict[str, tuple[Callable[[Sequence[Any]], Any], Callable[[Sequence[Jet]], Jet]]] = {
     "sum": (lambda us: sum(us[1:], start=us[0]), _jet_sum),
     "product": (lambda us: reduce(lambda u, v: u * v, us), lambda us: reduce(lambda u, v: u * v, us)),
@@ -489,9 +497,9 @@ OF_MANY: dict[str, tuple[Callable[[Sequence[Any]], Any], Callable[[Sequence[Jet]
     "min": (lambda us: reduce(jnp.minimum, us), partial(_jet_extreme, above=False)),
     "norm2": (lambda us: jnp.sum(jnp.stack(us) ** 2), lambda us: _jet_sum([u * u for u in us])),
     "norm": (lambda us: safe_norm(jnp.stack(us)), lambda us: _jet_power(0.5)(_jet_sum([u * u for u in us]))),
-    "logsumexp": (lambda us: jax.nn.logsumexp(jnp.stack(us)), lambda us: _JET_LOG(_jet_sum([_JET_EXP(u) for u in us]))),
-    "logaddexp": (lambda us: reduce(jnp.logaddexp, us), lambda us: _JET_LOG(_jet_sum([_JET_EXP(u) for u in us]))),
-    "log of exps": (lambda us: jnp.log(sum(map(jnp.exp, us))), lambda us: _JET_LOG(_jet_sum([_JET_EXP(u) for u in us]))),
+    "logsumexp": (lambda us: jax.nn.logsumexp(jnp.stack(us)), _jet_logsumexp),
+    "logaddexp": (lambda us: reduce(jnp.logaddexp, us), _jet_logsumexp),
+    "log of exps": (lambda us: jnp.log(sum(map(jnp.exp, us))), _jet_logsumexp),
 }
 
 NUMBERS = 12

@@ -42,6 +42,13 @@ def tug(near: float = 3.0, nearer: float = 2.0) -> Team:
     return cs.Team(agents, links="line")
 
 
+@jax.jit
+def observed(observer: Objective, x: jax.Array) -> tuple[jax.Array, ...]:
+    """Agent margins, smooth margin, every ψ and every multiplier at the formations (T, N, d)."""
+    nu = Nu(5.0, 5.0)
+    return jax.vmap(lambda p: (observer.agent_margins(p), observer.smooth_margin(p, nu), observer.psi(p), observer.multipliers(p, nu)))(x)
+
+
 @float64
 def made(
     team: Team,
@@ -58,14 +65,7 @@ def made(
     steps = np.linspace(0.0, 300.0, samples) if clock == "time" else np.arange(samples)
     x = end + np.exp(-20 * np.arange(samples) / samples)[:, None, None] * (start - end)
     x[-1] = end
-    observer, nu = Objective.at_positions(team), Nu(5.0, 5.0)
-
-    @jax.jit
-    @jax.vmap
-    def look(p: jax.Array) -> tuple[jax.Array, ...]:
-        return observer.agent_margins(p), observer.smooth_margin(p, nu), observer.psi(p), observer.multipliers(p, nu)
-
-    own, smooth, psi, multiplier = map(np.asarray, look(jnp.asarray(x)))
+    own, smooth, psi, multiplier = map(np.asarray, observed(Objective.at_positions(team), jnp.asarray(x)))
     margin, psi, multiplier = own.min(axis=1), psi[-1], multiplier[-1]
     count, since = team.count, satisfied_from(steps, margin, interpolate=clock == "time")
     holder, held = (index.ravel() for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
@@ -84,10 +84,11 @@ def made(
         }
         for i, agent in enumerate(team.ids)
     }
+    bounds = [float(margin[-1]), float(margin[-1]) + 0.05] if len(psi) else [None, None]
     summary = {
         "scenario": "made up", "version": "0", "protocol": "gradient-flow", "estimates": "full", "seed": 7, "ending": "settled",
         "status": "satisfied" if margin[-1] > 0 else "least-violating", "verdict": "feasible" if margin[-1] > 0 else "infeasible",
-        "margin": float(margin[-1]), "smooth_margin": float(smooth[-1]), "bounds": [float(margin[-1]), float(margin[-1]) + 0.05] if len(psi) else [None, None],
+        "margin": float(margin[-1]), "smooth_margin": float(smooth[-1]), "bounds": bounds,
         "satisfied_from": {"time": since if clock == "time" else None, "round": since if clock == "round" else None},
         "rounds": samples - 1 if clock == "round" else None, "messages": None, "floats_sent": None, "count": count,
         "positions": {agent: row.tolist() for agent, row in zip(team.ids, end, strict=True)}, "agents": entries,

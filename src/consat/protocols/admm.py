@@ -65,13 +65,18 @@ class Admm:
     name = "admm"
     per = AdmmState(x="row", u="link", wish="row", heard="link", penalty="link", memory="agent")
 
+    def earliest(self, solver: Solver) -> int:  # noqa: ARG002
+        return 0
+
     def start(self, x: Array, solver: Solver) -> AdmmState:
         at_links = solver.links.at(x)
         wish = jnp.zeros(len(x)) + jnp.log(self.penalty / solver.length**2)
         level = solver.links.at(wish)
         return AdmmState(x, at_links, wish, level, level, solver.recall(x, jnp.exp(wish)))
 
-    def speak(self, state: AdmmState, solver: Solver, round_: Array) -> tuple[AdmmState, tuple[Array, Array]]:
+    def speak(
+        self, state: AdmmState, solver: Solver, round_: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[AdmmState, tuple[Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
         penalty = 0.5 * (links.at(wish) + state.heard)
@@ -79,7 +84,7 @@ class Admm:
         rho = jnp.exp(penalty)
         kappa, linked = links.sum(rho), links.degree > 0
         v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
-        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory)
+        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory, sharper, above)
         neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
         goal = jnp.where(jnp.isnan(stiffness), neighbours, jnp.log(self.share * stiffness + jnp.finfo(x.dtype).tiny))
         most = (self.pace + self.quickening * round_) / (1.0 + (round_ / self.horizon) ** 4)

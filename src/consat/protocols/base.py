@@ -104,6 +104,11 @@ class Solver(Protocol):
         """The team's unit of length, common knowledge: the scenario's scale."""
         ...
 
+    @property
+    def hops(self) -> int:
+        """Links that a message crosses, at most, from one agent of a cluster to another; common knowledge."""
+        ...
+
     def recall(self, x: Array, kappa: Array) -> Memory:
         """What its solver remembers before the first step from x, (rows, d), at weights κ, (rows,)."""
         ...
@@ -111,7 +116,8 @@ class Solver(Protocol):
     def prox(
         self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[Array, Memory, Array]:
-        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖², with ν multiplied by `sharper` and f_i = e^{−ν_β (α_i − above)} / `sharper`.
+        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖², with ν multiplied by `sharper` and f_i = e^{−ν_β (α_i − above)} / `sharper`;
+        `above` is one number an agent, or one for all.
 
         Returns:
             (rows, d) the solution, the solver's memory, and (rows,) the mean diagonal of ∇²f_i, NaN where no constraint reads a row.
@@ -120,6 +126,14 @@ class Solver(Protocol):
 
     def margin(self, x: Array) -> Array:
         """ᾱ_i at its estimates, one number an agent; +∞ without constraints."""
+        ...
+
+    def to_rows(self, numbers: Array) -> Array:
+        """One number an agent → (rows,)."""
+        ...
+
+    def least(self, numbers: Array) -> Array:
+        """(links,) → the smallest over all of an agent's links, one number an agent; +∞ without links."""
         ...
 
 
@@ -134,6 +148,10 @@ class Rounds(Protocol):
     @property
     def name(self) -> str:
         """What ``--protocol`` calls it."""
+        ...
+
+    def earliest(self, solver: Solver) -> int:
+        """The round before which to stand still means nothing."""
         ...
 
     def start(self, x: Array, solver: Solver) -> Any:

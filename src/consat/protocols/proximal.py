@@ -48,6 +48,9 @@ class Proximal:
     name = "proximal"
     per = ProximalState(x="row", z="row", heard="link", memory="agent")
 
+    def earliest(self, solver: Solver) -> int:  # noqa: ARG002
+        return 0
+
     def start(self, x: Array, solver: Solver) -> ProximalState:
         return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
 

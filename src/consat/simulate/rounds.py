@@ -14,6 +14,7 @@ from jax import Array
 
 from consat import prox
 from consat.estimates import Estimates
+from consat.graphs import hops
 from consat.numerics import CompileClock, Groups, float64, quick_compilation
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds
@@ -86,7 +87,10 @@ class Everyone:
         batches: the agents by shape.
         nu: the smoothing.
         local: every agent's objective over its copies.
+        holder: (C,) who holds each copy.
+        talkers: groups the ends by agent.
         agents: N.
+        hops: see `consat.graphs.hops`.
     """
 
     links: Ends
@@ -94,7 +98,10 @@ class Everyone:
     batches: tuple[prox.Bucket, ...]
     nu: Nu
     local: Objective
+    holder: Array
+    talkers: Groups
     agents: int = field(metadata={"static": True})
+    hops: int = field(metadata={"static": True})
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
         return prox.recall(self.batches, self.agents, self.nu, x, kappa)
@@ -107,6 +114,12 @@ class Everyone:
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
+
+    def to_rows(self, numbers: Array) -> Array:
+        return numbers[self.holder]
+
+    def least(self, numbers: Array) -> Array:
+        return -self.talkers.max(-numbers)
 
 
 @dataclass(frozen=True)
@@ -158,7 +171,6 @@ class _World:
         everyone: the agents.
         observer: of their true positions.
         own: (N,) rows of own positions.
-        holder: (C,) who holds each copy.
         talker: (E,) who speaks at each end.
         pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
         reach: most that a body moves in a round.
@@ -172,7 +184,6 @@ class _World:
     everyone: Everyone
     observer: Objective
     own: Array
-    holder: Array
     talker: Array
     pair: Array
     reach: Array
@@ -219,12 +230,12 @@ def _see(world: _World, x: Array, body: Array, messages: Array, floats: Array) -
 
 def _where_awake(protocol: Rounds, world: _World, awake: Array, new: Any, old: Any) -> Any:
     """The new state of those awake, the old one of those asleep."""
-    masks = {"row": awake[world.holder], "link": awake[world.talker], "agent": awake}
+    masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
 
-    def choose(mask: Array) -> Callable[[Array, Array], Array]:
-        return lambda fresh, stale: jnp.where(mask.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, stale)
+    def choose(per: str, fresh: Any, stale: Any) -> Any:
+        return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
 
-    return type(new)(*(jax.tree.map(choose(masks[per]), *parts) for per, *parts in zip(protocol.per, new, old, strict=True)))
+    return jax.tree.map(choose, protocol.per, new, old)
 
 
 def _rounds(protocol: Rounds, world: _World, now: _Now, numbers: Array) -> tuple[_Now, Seen]:
@@ -260,7 +271,8 @@ def simulate_rounds(
     weather: Weather | None = None,
     body: Body | None = None,
     record: bool | None = None,
-    proven: Callable[[np.ndarray], bool] = lambda _: False,
+    hopeless: Callable[[np.ndarray], bool] = lambda _: False,
+    enough: Callable[[np.ndarray], bool] | None = None,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Trace:
     """Run a protocol in rounds.
@@ -274,12 +286,12 @@ def simulate_rounds(
         first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
         convex: whether every ψ is known to be concave.
         rounds: how many; `PATIENCE` if None.
-        stop: when to end earlier: every margin positive for `HOLD` rounds (or `proven` and settled), settled, or never.
+        stop: when to end earlier: every margin positive for `HOLD` rounds (or `hopeless` and settled); settled, or `enough`; or never.
         weather: loss and sleep; none if None.
         body: how fast positions follow estimates; at once if None.
         record: whether to keep all estimates; if None, while they are few.
-        proven: says of (N, d) settled positions whether they need no further rounds: no formation satisfies every constraint, or none
-            is better by more than the tolerance.
+        hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
+        enough: says of (N, d) positions whether no formation is better by more than a tolerance.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     weather = weather or Weather()
@@ -299,7 +311,8 @@ def simulate_rounds(
                 seen.append(jax.tree.map(np.asarray, looked))
                 done += count
                 progress(done / end, float(seen[-1].margin[-1]))
-                if (found := _ending(seen, stop, length, proven)) is not None:
+                settle = done >= protocol.earliest(world.everyone)
+                if (found := _ending(seen, stop, length, settle, hopeless, enough)) is not None:
                     ending = found
                     break
         except KeyboardInterrupt:
@@ -320,7 +333,10 @@ def _world(
         batches=prox.buckets(team, copies.rows, copies.count, convex),
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
+        holder=jnp.asarray(copies.holder),
+        talkers=Groups.of(copies.holder[copies.edges[:, 0]], team.count),
         agents=team.count,
+        hops=hops(team.count, copies.links),
     )
     talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
     pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)
@@ -328,7 +344,6 @@ def _world(
         everyone=everyone,
         observer=Objective.at_positions(team),
         own=jnp.asarray(copies.own),
-        holder=jnp.asarray(copies.holder),
         talker=jnp.asarray(talker, dtype=jnp.int32),
         pair=jnp.asarray(pair, dtype=jnp.int32),
         reach=jnp.asarray(np.inf if body is None else body.speed / body.rate),
@@ -347,23 +362,22 @@ def _satisfied_at(margin: np.ndarray) -> int:
     return int(whole[0]) + HOLD - 1 if len(whole) else -1
 
 
-def _ending(seen: list[Seen], stop: Stop, length: float, proven: Callable[[np.ndarray], bool]) -> Ending | None:
+def _ending(
+    seen: list[Seen], stop: Stop, length: float, settle: bool, hopeless: Callable[[np.ndarray], bool],
+    enough: Callable[[np.ndarray], bool] | None,
+) -> Ending | None:  # fmt: skip
     last = seen[-1]
     if not np.isfinite(last.position).all():
         return "diverged"
     if stop == "never":
         return None
-    recent = [part for part in seen[-3:]]
-    margin = np.concatenate([part.margin for part in recent])
-    if stop == "satisfied" and _satisfied_at(margin) >= 0:
+    if stop == "satisfied" and _satisfied_at(np.concatenate([part.margin for part in seen[-3:]])) >= 0:
         return "satisfied"
-    position = np.concatenate([part.position for part in recent])[-HOLD:]
-    if len(position) < HOLD:
-        return None
-    settled = np.abs(position - position[-1]).max(initial=0.0) <= SETTLED * length
-    if settled and (stop == "converged" or proven(position[-1])):
+    if stop == "converged" and enough is not None and enough(last.position[-1]):
         return "settled"
-    return None
+    position = np.concatenate([part.position for part in seen[-3:]])[-HOLD:]
+    settled = settle and len(position) == HOLD and np.abs(position - position[-1]).max(initial=0.0) <= SETTLED * length
+    return "settled" if settled and (stop == "converged" or hopeless(position[-1])) else None
 
 
 def _trace(

@@ -1,0 +1,75 @@
+"""Exact max-min: relaxed ADMM while ν rises, so that the maximiser of the smooth margin β becomes that of the margin β̄.
+
+In stage s the agents minimise  Σ_i e^{−ν_s (α_i − t)} / 2^s  with ν_s = 2^s ν, where t, the margin of the team in
+the last stage, keeps the numbers near one. Agents find t by min-consensus: each passes on the smallest ᾱ_j it has heard of in its stage,
+and learns no more than that; a stage lasts long enough for the smallest to reach everyone. β̄* − β̄ ≤ (ln N + ln m̄)/ν_s (paper, eq. 12) halves with every stage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from consat.protocols.admm import Admm, AdmmState
+from consat.protocols.base import Solver
+
+
+class MaxMinState(NamedTuple):
+    """What an agent remembers.
+
+    Attributes:
+        x: (rows, d) estimates.
+        admm: the state of `consat.protocols.admm`.
+        heard: one number an agent, the smallest margin heard of in this stage.
+        level: one number an agent, t.
+    """
+
+    x: Array
+    admm: AdmmState
+    heard: Array
+    level: Array
+
+
+@dataclass(frozen=True)
+class MaxMin:
+    """See the module.
+
+    Attributes:
+        stage: rounds at each ν, beside those that a number needs to cross the team.
+        stages: how often ν doubles.
+        admm: how each stage is solved.
+    """
+
+    stage: int = 20
+    stages: int = 10
+    admm: Admm = Admm(pace=0.2, quickening=0.0)
+    name = "max-min"
+    per = MaxMinState(x="row", admm=Admm.per, heard="agent", level="agent")
+
+    def earliest(self, solver: Solver) -> int:
+        return self.stages * (self.stage + solver.hops)
+
+    def start(self, x: Array, solver: Solver) -> MaxMinState:
+        margin = solver.margin(x)
+        return MaxMinState(x, self.admm.start(x, solver), margin, jnp.zeros_like(margin))
+
+    def speak(self, state: MaxMinState, solver: Solver, round_: Array) -> tuple[MaxMinState, tuple[tuple[Array, Array], Array]]:
+        stage = self.stage + solver.hops
+        number, within = jnp.floor(round_ / stage), round_ % stage
+        turn = (number > 0) & (number <= self.stages) & (within == 0)
+        level = jnp.where(turn, state.heard, state.level)
+        sharper = 2.0 ** jnp.minimum(number, self.stages)
+        admm, message = self.admm.speak(state.admm, solver, within, sharper, jnp.where(number > 0, level, 0.0))
+        margin = solver.margin(admm.x)
+        # what was heard in the first half of a stage is of positions still on their way
+        fresh = within <= self.stage // 2
+        heard = jnp.where(fresh, margin, jnp.minimum(state.heard, margin))
+        return MaxMinState(admm.x, admm, heard, level), (message, solver.links.at(solver.to_rows(heard)))
+
+    def hear(self, state: MaxMinState, message: tuple[tuple[Array, Array], Array], arrived: Array, solver: Solver) -> MaxMinState:
+        points, margins = message
+        least = solver.least(jnp.where(arrived, margins, jnp.inf))
+        return state._replace(admm=self.admm.hear(state.admm, points, arrived, solver), heard=jnp.minimum(state.heard, least))
