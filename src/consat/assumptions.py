@@ -42,8 +42,8 @@ def report(team: Team) -> dict[str, Any]:
     count = int(cluster.max(initial=-1)) + 1
     return {
         "schema": SCHEMA,
-        "agents": team.count,
-        "ids": list(team.ids) if listed else None,
+        "agents": list(team.ids) if listed else None,
+        "count": team.count,
         "clusters": _members(team, cluster, count) if listed else None,
         "cluster_count": count,
         "communication_connected": not parts,

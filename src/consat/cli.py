@@ -6,7 +6,7 @@ import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -133,10 +133,13 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     loaded = _load(scenario, overrides)
     from consat.assumptions import report
     from consat.graphs import require_connected
-    from consat.views import words
+    from consat.views import tables
 
     findings = report(loaded.team)
-    click.echo(json.dumps(findings) if as_json else words.check(loaded.name, findings))
+    if as_json:
+        click.echo(json.dumps(findings))
+    else:
+        _show(tables.check(loaded.name, findings))
     with _located(loaded):
         require_connected(loaded.team)
     return DONE
@@ -153,11 +156,14 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     _cache_compilations()
     loaded = _load(scenario, overrides)
     from consat.runner import solve as solve_team
-    from consat.views import words
+    from consat.views import tables
 
     with _located(loaded):
         answer = solve_team(loaded, seed=seed, auxiliary=auxiliary)
-    click.echo(json.dumps(answer) if as_json else words.solve(answer))
+    if as_json:
+        click.echo(json.dumps(answer))
+    else:
+        _show(tables.solve(answer))
     return DONE if answer["verdict"] == "feasible" else UNSATISFIED
 
 
@@ -229,6 +235,15 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, float | None], None]]:
             bar.update(task, completed=done, margin="" if margin is None else f"margin {margin:+.4g}")
 
         yield update
+
+
+def _show(parts: Iterable[Any]) -> None:
+    """Rich text on stdout; as wide as its content where that is no terminal."""
+    from rich.console import Console
+
+    console = Console() if sys.stdout.isatty() else Console(width=160)
+    for part in parts:
+        console.print(part, highlight=False)
 
 
 def _say(text: str) -> None:

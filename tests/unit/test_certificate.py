@@ -6,9 +6,10 @@ from scipy.optimize import minimize
 import consat as cs
 from consat.certificate import bounds
 from consat.graphs import clusters
+from consat.levels import radii
 from consat.numerics import float64
 from consat.objective import Nu, Objective, margin_bounds
-from consat.quadratics import values_and_gradients
+from consat.quadratics import expand, values_and_gradients
 from consat.reference import cluster_margins, max_min
 from tests.unit.teams import MARGINS, case, grid, many
 
@@ -168,3 +169,26 @@ def test_a_grid_is_certified_by_its_multipliers() -> None:
     optimum = max_min(team)
     found = bounds(team, optimum.positions, refine=False, multipliers=optimum.multipliers)
     assert found.lower <= found.upper <= found.lower + 1e-4 * abs(found.lower)
+
+
+def test_radii_hold_everyone_who_is_better() -> None:
+    """On a line, a ≤ 0 and −5 ≤ b within 2 of each other, seen from a = 0, b = −1 with margin 0: a is in [−7, 0] and b in [−5, 2]."""
+    team = cs.Team([cs.Agent("a", [cs.halfspace([1], 0)]), cs.Agent("b", [cs.near("a", 2), cs.halfspace([-1], 5)])], dimension=1)
+    radius = radii(expand(team, np.array([[0.0], [-1]])), np.zeros(3), clusters(team))
+    assert 7 <= radius[0] < 20
+    assert 4 <= radius[1] < 20
+
+
+def test_radii_hold_the_optimum_of_random_problems() -> None:
+    """Any two formations of which one is the better: the better one is within the radii of the other."""
+    team = many(300, 11, 2)
+    cluster, optimum = clusters(team), max_min(team)
+    best = cluster_margins(team, values_and_gradients(team, optimum.positions)[0], cluster)
+    for off in (1e-3, 1e-1, 10.0):
+        x = optimum.positions + off * np.random.default_rng(0).normal(size=optimum.positions.shape)
+        model = expand(team, x)
+        margins = cluster_margins(team, model.value, cluster)
+        radius = radii(model, margins[cluster[team.owner]], cluster)
+        away = np.linalg.norm(optimum.positions - x, axis=1)
+        assert np.all((away <= radius * (1 + 1e-9)) | (margins > best)[cluster])
+        assert np.isfinite(radius).all()  # every cluster of these has a region

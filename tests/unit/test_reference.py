@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 import consat as cs
 from consat.graphs import clusters
 from consat.quadratics import expand, values_and_gradients
-from consat.reference import cluster_margins, max_min
+from consat.reference import cluster_margins, concave_part, max_min
 from tests.unit.teams import MARGINS, case, grid, many
 
 SOLVER = 1e-7
@@ -142,3 +142,12 @@ def test_a_grid_of_five_hundred() -> None:
     model = expand(team, optimum.positions)
     assert optimum.multipliers @ model.value == pytest.approx(optimum.margin, abs=1e-5)
     assert np.abs(model.gradient(optimum.multipliers)).max() < 1e-4  # square root of the solver's tolerance
+
+
+def test_the_concave_part_lies_below_and_is_exact_where_all_is_concave() -> None:
+    team = cs.Team([cs.Agent("a", [cs.expr("a.x**2 - 2*a.y**2"), cs.within([1, 0], 1)])])
+    at, y = np.array([[0.3, -0.2]]), np.array([[0.5, 0.7]])
+    model = expand(team, at)
+    lower = concave_part(model).values(y)
+    expected = model.values(y) - [y[0, 0] ** 2, 0]  # the curvature of x² is what is left out
+    np.testing.assert_allclose(lower, expected, atol=1e-12)  # rounding

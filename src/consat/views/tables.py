@@ -1,0 +1,78 @@
+"""What `consat check` and `consat solve` show on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from consat.views.words import VERDICT
+
+MOST_ROWS = 30
+"""Of longer lists only the beginning is shown."""
+CURVATURE = {
+    "strictly-concave": "strictly concave",
+    "concave": "concave",
+    "unknown": "[yellow]unknown[/]",
+    "not-concave": "[yellow]not concave[/]",
+}
+ANSWER = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]open[/]"}
+
+
+def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """The findings of `consat.assumptions.report`, for people."""
+    clusters = findings["clusters"]
+    shape = f"{findings['count']} agents, {findings['constraint_count']} constraints, {findings['cluster_count']} clusters"
+    yield f"[bold]{escape(name)}[/]: {shape}"
+    if clusters is not None and 1 < len(clusters) <= MOST_ROWS:
+        yield "  " + "; ".join(escape("{" + ", ".join(cluster[:8]) + (", …" if len(cluster) > 8 else "") + "}") for cluster in clusters)
+    table = _table("agent", "constraint", "reads", "curvature", "strict in own position")
+    constraints = findings["constraints"] or []
+    for row in constraints[:MOST_ROWS]:
+        strict = "yes" if row["strict_in_own"] else "no"
+        table.add_row(escape(row["agent"]), escape(row["name"]), escape(", ".join(row["reads"])), CURVATURE[row["curvature"]], strict)
+    yield table
+    if len(constraints) > MOST_ROWS:
+        yield f"  … and {len(constraints) - MOST_ROWS} more; --json lists all"
+    yield f"convex: {ANSWER[findings['convex']]}   one optimum: {ANSWER[findings['unique_optimum']]}   bounded: {ANSWER[findings['bounded']]}"
+    for assumption in findings["assumptions"]:
+        yield f"Assumption {assumption['number']}: {ANSWER[assumption['holds']]}. {escape(assumption['what'])}"
+        if assumption["cure"]:
+            yield f"  [bold]→[/] {escape(assumption['cure'])}"
+
+
+def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """The answer of `consat.solve`, for people."""
+    lower, upper = answer["bounds"]
+    yield f"[bold]{escape(answer['scenario'])}[/]: {VERDICT[answer['verdict']]}"
+    proven = "nothing better is ruled out" if upper is None else f"proven: none is better than {upper:.6g}"
+    yield f"  best margin {_number(answer['margin'])} (in hand {_number(lower)}; {proven})"
+    yield f"  {escape(answer['method'])}"
+    table = _table("agent", "position", "binds", "multiplier")
+    binding: dict[str, list[tuple[str, float]]] = {}
+    for row in answer["binding"]:
+        binding.setdefault(row["agent"], []).append((row["constraint"], row["multiplier"]))
+    agents = sorted(answer["positions"], key=lambda agent: -max((m for _, m in binding.get(agent, [])), default=0.0))
+    for agent in agents[:MOST_ROWS]:
+        position = "(" + ", ".join(_number(x) for x in answer["positions"][agent]) + ")"
+        names, values = zip(*binding.get(agent, [("", None)]), strict=True)
+        table.add_row(escape(agent), position, escape("\n".join(names)), "\n".join("" if v is None else f"{v:.3f}" for v in values))
+    yield table
+    if len(agents) > MOST_ROWS:
+        yield f"  … and {len(agents) - MOST_ROWS} agents more; --json lists all"
+    for reason in answer["reasons"]:
+        yield f"[bold]→[/] {escape(reason)}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=True, header_style="dim")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "unbounded" if value is None else f"{value:.6g}"
