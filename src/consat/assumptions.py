@@ -33,7 +33,7 @@ AUXILIARY = "auxiliary"
 def report(team: Team) -> dict[str, Any]:
     """What ``check --json`` prints (schema consat.check/1).
 
-    ``agents`` is their number; ``ids``, ``clusters`` and ``constraints`` are null above `MOST_LISTED` agents.
+    ``agents`` (their ids), ``clusters`` and ``constraints`` are null above `MOST_LISTED` agents.
     """
     shape, cluster = shape_of(team), clusters(team)
     listed = team.count <= MOST_LISTED
@@ -104,7 +104,7 @@ def with_auxiliary(team: Team, radius: float, center: ArrayLike | None = None) -
     )  # fmt: skip
     owner = np.insert(team.owner, ends, agents).astype(np.int32)
     names = np.insert(np.array(team.names, dtype=object), ends, AUXILIARY).tolist()
-    return Team.of_parts(team.ids, [*moved, added], owner, tuple(names), team.links, team.starts, team.dimension)
+    return team.with_constraints([*moved, added], owner, tuple(names))
 
 
 def binding_auxiliaries(team: Team, multipliers: Floats, threshold: float = 1e-6) -> list[str]:

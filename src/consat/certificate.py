@@ -24,7 +24,7 @@ from consat.conic import normalised, units
 from consat.graphs import clusters
 from consat.levels import radii, with_tangents
 from consat.numerics import float64
-from consat.objective import Nu, Objective
+from consat.objective import Nu, Objective, weigh
 from consat.quadratics import Expansion, Floats, Ints, expand, shape_of
 from consat.reference import middle
 from consat.team import Team
@@ -139,7 +139,7 @@ class _Proof:
         rungs = RUNGS if self.model.size <= LARGE else RUNGS[::3]
         candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in rungs]
         if nu is not None:
-            own = np.asarray(Objective.at_positions(self.team).multipliers(jnp.asarray(self.model.at), nu))
+            own = np.asarray(weigh(Objective.at_positions(self.team), jnp.asarray(self.model.at), nu)[1])
             candidates.append(normalised(np.where(self.concave, own, 0.0), self.group, self.count))
         if multipliers is not None:
             candidates.append(normalised(np.where(self.concave, multipliers, 0.0), self.group, self.count))

@@ -243,7 +243,7 @@ def _show(parts: Iterable[Any]) -> None:
 
     console = Console() if sys.stdout.isatty() else Console(width=160)
     for part in parts:
-        console.print(part, highlight=False)
+        console.print(part, highlight=False, soft_wrap=isinstance(part, str))
 
 
 def _say(text: str) -> None:

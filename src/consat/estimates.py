@@ -1,8 +1,8 @@
 """Who holds a copy of whose position, and the consensus between copies.
 
 State is one row per copy (holder, position), ordered by holder, so an agent's rows stand together. "full" is the paper's layout: every
-agent holds every position of its cluster. "local" holds only what is needed: every convergence proof of the
-full scheme carries over, since the null space of the block Laplacian is still "all copies of each x_j agree" (arXiv 2203.00681, 1805.08460).
+agent holds every position of its cluster. "local" holds only what is needed: every convergence proof of the full scheme carries over,
+since the null space of the block Laplacian is still "all copies of each x_j agree" (arXiv 2203.00681, 1805.08460).
 """
 
 from __future__ import annotations

@@ -56,7 +56,8 @@ def disconnected(team: Team) -> list[list[list[str]]]:
     first = np.full(cluster.max() + 1, -1)
     first[cluster[::-1]] = part[::-1]
     broken = np.unique(cluster[part != first[cluster]])
-    return [[[team.ids[i] for i in np.flatnonzero((cluster == c) & (part == p))] for p in np.unique(part[cluster == c])] for c in broken]
+    parts = [[np.flatnonzero((cluster == c) & (part == p)) for p in np.unique(part[cluster == c])] for c in broken]
+    return [[[team.ids[int(i)] for i in members] for members in of_cluster] for of_cluster in parts]
 
 
 def require_connected(team: Team) -> None:
@@ -81,14 +82,15 @@ def hops(count: int, links: np.ndarray) -> int:
     """
     graph = coo_array((np.ones(len(links), dtype=np.int8), (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
     longest, labels = 0, _components(links, count)
-    for first in np.unique(labels, return_index=True)[1]:
+    for start in np.unique(labels, return_index=True)[1]:
+        far = start
         for _ in range(2):
-            order, parent = breadth_first_order(graph, first, directed=False)
+            order, parent = breadth_first_order(graph, far, directed=False)
             depth = np.zeros(count, dtype=np.int64)
             for agent in order[1:]:
                 depth[agent] = depth[parent[agent]] + 1
-            first = order[np.argmax(depth[order])]
-            longest = max(longest, int(depth[first]))
+            far = order[np.argmax(depth[order])]
+            longest = max(longest, int(depth[far]))
     return longest
 
 

@@ -6,7 +6,7 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -63,17 +63,18 @@ class Groups:
     def of(cls, group: np.ndarray, count: int) -> Groups:
         """Args: group: (E,) int, the group of each element; count: how many groups there are."""
         group = np.asarray(group, dtype=np.int32)
+        device = jnp.asarray(group)
         sizes = np.bincount(group, minlength=count)
         width = int(sizes.max(initial=0))
         if count * width == len(group) and np.all(group[1:] >= group[:-1]):
-            return cls(group, None, count, width, padded=True)
+            return cls(device, None, count, width, padded=True)
         order = np.argsort(group, kind="stable").astype(np.int32)
         if count * width > PADDING_LIMIT * max(len(group), count):
-            return cls(group, order, count, width, padded=False)
+            return cls(device, jnp.asarray(order), count, width, padded=False)
         index = np.full((count, width), len(group), dtype=np.int32)
         ranked = group[order]
         index[ranked, np.arange(len(group)) - (np.cumsum(sizes) - sizes)[ranked]] = order
-        return cls(group, index, count, width, padded=True)
+        return cls(device, jnp.asarray(index), count, width, padded=True)
 
     def spread(self, values: Array) -> Array:
         """(G, …) → (E, …): to each element the value of its group."""
@@ -124,14 +125,14 @@ class CompileClock:
         self._begin = 0.0
         self.seconds: dict[str, float] = {"compile": 0.0, "run": 0.0}
 
-    def __enter__(self) -> CompileClock:
+    def __enter__(self) -> Self:
         self._begin = time.perf_counter()
         jax.monitoring.register_event_time_span_listener(self._hear)
         return self
 
-    def _hear(self, event: str, start: float, end: float, **_: str | int) -> None:
+    def _hear(self, event: str, start_time: float, end_time: float, **_: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
-            self._spans.append((start, end))
+            self._spans.append((start_time, end_time))
 
     def __exit__(self, *_: object) -> None:
         jax.monitoring.unregister_event_time_span_listener(self._hear)

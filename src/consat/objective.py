@@ -10,6 +10,7 @@ p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -188,8 +189,14 @@ class Objective:
         return nu.beta / nu.alpha * log_h, self.arguments.sum(jnp.concatenate(pieces))
 
 
+@jax.jit
+def weigh(observer: Objective, x: Array, nu: Nu) -> tuple[Array, Array]:
+    """(M,) every ψ_ik and (M,) λ_ik at one formation, compiled as one program."""
+    return observer.psi(x), observer.multipliers(x, nu)
+
+
 def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, float]:
     """The paper's interval β ≤ β̄ ≤ β + ln(N)/ν_β + ln(m̄)/ν_α (eq. 11), at one formation; over agents that have constraints."""
     sizes = team.constraints_per_agent
-    slack = np.log(max(np.count_nonzero(sizes), 1)) / float(nu.beta) + np.log(max(sizes.max(initial=1), 1)) / float(nu.alpha)
-    return smooth_margin, smooth_margin + float(slack)
+    slack = math.log(max(np.count_nonzero(sizes), 1)) / float(nu.beta) + math.log(max(int(sizes.max()) if len(sizes) else 1, 1)) / float(nu.alpha)
+    return smooth_margin, smooth_margin + slack

@@ -178,13 +178,11 @@ class _Search(NamedTuple):
     low: Array
     high: Array
     stiffness: Array
-    count: Array
+    iterations: Array
     done: Array
 
 
-def solve(
-    level: Level, v: Array, kappa: Array, guess: Guess, tolerance: Array | float, convex: bool
-) -> tuple[Guess, Array, Array]:
+def solve(level: Level, v: Array, kappa: Array, guess: Guess, tolerance: Array | float, convex: bool) -> tuple[Guess, Array, Array]:
     """The prox of ONE agent.
 
     Args:
@@ -252,14 +250,16 @@ def solve(
             low=jnp.where(sharpen, -jnp.inf, low),
             high=jnp.where(sharpen, jnp.inf, high),
             stiffness=multiplier * jnp.mean(jnp.abs(jnp.diag(bend) + slope**2).reshape(n, d), axis=1),
-            count=at.count + 1,
+            iterations=at.iterations + 1,
             done=done,
         )
 
     infinity = jnp.asarray(jnp.inf, v.dtype)
-    start = _Search(guess.y.reshape(-1), guess.sigma, guess.sharpness, -infinity, infinity, jnp.zeros(n), jnp.asarray(0), jnp.asarray(False))
-    end = jax.lax.while_loop(lambda at: ~at.done & (at.count < MOST_ITERATIONS), step, start)
-    return Guess(end.y.reshape(n, d), end.sigma, end.sharpness), end.stiffness, end.count
+    start = _Search(
+        guess.y.reshape(-1), guess.sigma, guess.sharpness, -infinity, infinity, jnp.zeros(n), jnp.asarray(0), jnp.asarray(False)
+    )
+    end = jax.lax.while_loop(lambda at: ~at.done & (at.iterations < MOST_ITERATIONS), step, start)
+    return Guess(end.y.reshape(n, d), end.sigma, end.sharpness), end.stiffness, end.iterations
 
 
 def _twice(function: Callable[[Array], Array], y: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -324,7 +324,7 @@ def recall(batches: Sequence[Bucket], agents: int, nu: Nu, x: Array, kappa: Arra
 
 
 def step(
-    batches: Sequence[Bucket], nu: Nu, offset: Array | float, v: Array, kappa: Array, x: Array, memory: Memory, tolerance: float
+    batches: Sequence[Bucket], nu: Nu, v: Array, kappa: Array, x: Array, memory: Memory, *, offset: Array | float, tolerance: float
 ) -> tuple[Array, Memory, Array]:
     """Every agent's prox, over the rows of a state.
 
@@ -346,14 +346,13 @@ def step(
     stiff = jnp.full(len(kappa), jnp.nan)
     for batch in batches:
 
-        def solve_one(
-            kinds: tuple[Kind, ...], rows: Array, remembered: Memory, above: Array, batch: Bucket = batch
-        ) -> tuple[Guess, Array]:
+        def solve_one(kinds: tuple[Kind, ...], rows: Array, remembered: Memory, above: Array, batch: Bucket = batch) -> tuple[Guess, Array]:
             one = _One(batch.psi, kinds, nu, above)
             found, bend, _ = solve(one.level, near[rows], weight[rows][:, None], Guess(last[rows], *remembered), tolerance, batch.convex)
             return found, bend
 
-        found, bend = jax.vmap(solve_one)(batch.kinds, batch.rows, jax.tree.map(lambda leaf: leaf[batch.agents], memory), offset[batch.agents])
+        remembered = Memory(memory.sigma[batch.agents], memory.sharpness[batch.agents])
+        found, bend = jax.vmap(solve_one)(batch.kinds, batch.rows, remembered, offset[batch.agents])
         flat = batch.rows.reshape(-1)
         v = v.at[flat].set(found.y.reshape(-1, v.shape[1]), mode="drop")
         stiff = stiff.at[flat].set(bend.reshape(-1), mode="drop")

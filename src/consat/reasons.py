@@ -229,7 +229,7 @@ def turned(team: Team, knob: _Knob, amount: float) -> Team:
             families.append(dataclasses.replace(single, psi=_Slackened(family.psi), parameters=slack, sources=None))
             if not here.all():
                 families.append(_members(family, ~here))
-    return Team.of_parts(team.ids, families, team.owner, team.names, team.links, team.starts, team.dimension)
+    return team.with_constraints(families, team.owner, team.names)
 
 
 def restricted(team: Team, keep: Bools) -> Team:
@@ -242,7 +242,7 @@ def restricted(team: Team, keep: Bools) -> Team:
             kept = _members(family, members)
             families.append(dataclasses.replace(kept, number=place[kept.number].astype(np.int32)))
     names = [team.names[k] for k in np.flatnonzero(keep).tolist()]
-    return Team.of_parts(team.ids, families, team.owner[keep], names, team.links, team.starts, team.dimension)
+    return team.with_constraints(families, team.owner[keep], names)
 
 
 def _members(family: Family, members: Bools) -> Family:

@@ -44,7 +44,8 @@ class Result:
         """The recorded arrays with named dimensions, units and everything needed to repeat the run among the attributes."""
         if self._data is not None:
             return self._data
-        assert self._trace is not None and self._team is not None
+        assert self._trace is not None
+        assert self._team is not None
         return dataset(self._trace, self._team, self.summary, self.scenario)
 
     @functools.cached_property

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,7 +17,7 @@ from consat.certificate import BINDING, bounds
 from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
-from consat.objective import Nu, Objective, Schedule
+from consat.objective import Objective, Schedule, weigh
 from consat.protocols import FLOWS, ROUNDS
 from consat.quadratics import shape_of
 from consat.reasons import explain
@@ -109,56 +109,59 @@ def run(
     if kind not in FLOWS and kind not in ROUNDS:
         raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
     stop = stop or ("never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied")
+    options: dict[str, Any] = {"stop": stop, "record": record, "progress": progress}
     if kind in FLOWS:
-        _refuse(kind, "flows in continuous time; give until, or choose a protocol in rounds", rounds=rounds, loss=loss, sleep=sleep, rate=rate)
-        return _run(scenario, settings, full, lambda *given: _flow(*given, settings, until, stop, record, progress))
-    _refuse(kind, "goes in rounds; give rounds, or choose a flow", until=until)
-    if (speed is not None and rate is None) or (speed is not None and not speed > 0) or (rate is not None and not rate > 0):
+        _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
+        return _run(scenario, settings, full, functools.partial(_flow, settings.protocol, until=until, **options))
+    _refuse(f"protocol {kind} goes in rounds; use rounds", until=until)
+    if (speed is not None and rate is None) or not all(value is None or value > 0 for value in (speed, rate)):
         raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
     if not (0 <= loss < 1 and 0 <= sleep < 1):
         raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
     weather = Weather(loss, sleep, settings.start.seed)
     body = None if rate is None else Body(rate, np.inf if speed is None else speed)
-    return _run(scenario, settings, full, lambda *given: _rounds(*given, settings, rounds, stop, weather, body, record, progress))
+    return _run(
+        scenario, settings, full, functools.partial(_rounds, settings.protocol, rounds=rounds, weather=weather, body=body, **options)
+    )
 
 
-def _refuse(kind: str | None, why: str, **given: float | None) -> None:
+def _refuse(why: str, **given: float | None) -> None:
     if wrong := [name for name, value in given.items() if value]:
-        raise InvalidSettings(f"protocol {kind} {why}; {', '.join(wrong)} has no meaning for it")
+        raise InvalidSettings(f"{why}; {', '.join(wrong)} means nothing to it")
+
+
+class _Prepared(NamedTuple):
+    """A team made ready to run."""
+
+    team: Team
+    copies: Estimates
+    schedule: Schedule
+    size: Scale
+    first: np.ndarray
 
 
 @float64
-def _run(scenario: Scenario, settings: Settings, full: bool, simulate: Callable[[Team, Estimates, Schedule, Scale, np.ndarray], Trace]) -> Result:
+def _run(scenario: Scenario, settings: Settings, full: bool, simulate: Callable[[_Prepared], Trace]) -> Result:
     team = scenario.team
-    copies = Estimates.of(team, settings.protocol.estimates)
-    size = scale(team)
-    smoothing = automatic(size) if settings.smoothing == "auto" else settings.smoothing
-    schedule = Schedule.of(smoothing)
-    trace = simulate(team, copies, schedule, size, first_estimates(team, copies, settings.start, size))
+    copies, size = Estimates.of(team, settings.protocol.estimates), scale(team)
+    schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+    trace = simulate(_Prepared(team, copies, schedule, size, first_estimates(team, copies, settings.start, size)))
     return Result(summarise(scenario, settings, schedule, size, trace, full), trace=trace, team=team, scenario=scenario.text)
 
 
-def _flow(
-    team: Team, copies: Estimates, schedule: Schedule, _: Scale, first: np.ndarray, settings: Settings, until: float | None, stop: Stop,
-    record: bool | None, progress: Callable[[float, float], None],
-) -> Trace:  # fmt: skip
-    flow = _with_gains(FLOWS[settings.protocol.kind or ""](), settings.protocol)
+def _flow(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
     return simulate_flow(
-        team, flow, copies, schedule, first, until=until, stop=stop, record=record, progress=progress,
-        infeasible=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
+        on.team, _with_gains(FLOWS[str(asked.kind)](), asked), on.copies, on.schedule, on.first,
+        infeasible=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible", **options,
     )  # fmt: skip
 
 
-def _rounds(
-    team: Team, copies: Estimates, schedule: Schedule, size: Scale, first: np.ndarray, settings: Settings, rounds: int | None, stop: Stop,
-    weather: Weather, body: Body | None, record: bool | None, progress: Callable[[float, float], None],
-) -> Trace:  # fmt: skip
-    protocol = _with_gains(ROUNDS[settings.protocol.kind or ""](), settings.protocol)
+def _rounds(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
     return simulate_rounds(
-        team, protocol, copies, schedule.final, size.length, first, convex=bool(shape_of(team).concave.all()), rounds=rounds, stop=stop,
-        weather=weather, body=body, record=record, progress=progress,
-        hopeless=lambda position: bounds(team, position, schedule.final).verdict == "infeasible",
-        enough=(lambda position: _gap(team, position) <= SHARP * size.psi) if protocol.name == "max-min" else None,
+        on.team, _with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size.length, on.first,
+        convex=bool(shape_of(on.team).concave.all()),
+        hopeless=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible",
+        enough=(lambda position: _gap(on.team, position) <= SHARP * on.size.psi) if asked.kind == "max-min" else None, **options,
     )  # fmt: skip
 
 
@@ -229,7 +232,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     """What ``run --json`` prints (schema consat.run/1)."""
     team, position = scenario.team, trace.position[-1]
     nu = schedule.final
-    margins, multipliers = map(np.asarray, _final(Objective.at_positions(team), jnp.asarray(position), nu))
+    margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
     margin = _number(margins.min(initial=np.inf))
     certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
@@ -261,11 +264,6 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
     }
-
-
-@jax.jit
-def _final(observer: Objective, position: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
-    return observer.psi(position), observer.multipliers(position, nu)
 
 
 def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections import defaultdict
@@ -136,15 +137,11 @@ class Team:
         self.families = _families(entries)
         self.links = _unique(pairs) if pairs is not None else topology(cast(str, links), len(agents), self.families)
 
-    @classmethod
-    def of_parts(
-        cls, ids: Sequence[str], families: Iterable[Family], owner: np.ndarray, names: Sequence[str],
-        links: np.ndarray, starts: np.ndarray, dimension: int,
-    ) -> Team:  # fmt: skip
-        """A team from parts that are known to fit together, such as those of another team; see the attributes of `Team`."""
-        team = cls.__new__(cls)
-        team.ids, team.families, team.owner, team.names = ids, tuple(families), owner, names
-        team.links, team.starts, team.dimension = links, starts, dimension
+    def with_constraints(self, families: Iterable[Family], owner: np.ndarray, names: Sequence[str]) -> Team:
+        """The same agents and links with other constraints, which are known to fit; see the attributes of `Team`."""
+        team = copy.copy(self)
+        team.__dict__.pop("constraints_per_agent", None)
+        team.families, team.owner, team.names = tuple(families), owner, names
         return team
 
     @property
@@ -355,7 +352,7 @@ def _mistake(entry: _Entry, dimension: int) -> tuple[str, int]:
         shape = jax.eval_shape(functools.partial(entry.constraint.psi, **entry.values), *(position,) * len(entry.agents))
     except InvalidExpression as error:
         return error.message, error.column
-    except Exception as error:  # whatever the user's own function raises is a fault of the input
+    except Exception as error:  # noqa: BLE001 - whatever the user's own function raises is a fault of the input
         reason = str(error).strip().split("\n")[0]
         return f"ψ cannot be traced by JAX in dimension {dimension}: {reason or type(error).__name__}", 0
     leaves = jax.tree.leaves(shape)

@@ -106,7 +106,7 @@ def test_agrees_with_a_linear_program_over_everything() -> None:
 def test_report_is_json_with_the_fields_of_the_contract() -> None:
     found = json.loads(json.dumps(report(case("c"))))
     assert found["schema"] == "consat.check/1"
-    assert found["agents"] == 3
+    assert found["count"] == 3
     assert found["clusters"] == [["a1", "a2", "a3"]]
     assert found["communication_connected"] is True
     assert (found["convex"], found["unique_optimum"], found["bounded"]) == (True, True, True)

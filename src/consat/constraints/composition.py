@@ -210,8 +210,9 @@ def _term(node: Node, terms: tuple[Array, ...], order: int) -> Array:
 
 
 def _highest(degrees: Iterable[int | None]) -> int | None:
-    known = list(degrees)
-    return None if None in known else max(known)
+    given = list(degrees)
+    known = [degree for degree in given if degree is not None]
+    return max(known) if len(known) == len(given) else None
 
 
 def _aligned(*nodes: Node) -> list[Node]:

@@ -39,6 +39,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from consat.constraints.functions import safe_norm
 from consat.errors import InvalidExpression
 
 MAX_LENGTH: Final = 2000
@@ -46,12 +47,6 @@ MAX_DEPTH: Final = 50
 MAX_NODES: Final = 400
 MAX_EXPONENT: Final = 16
 MAX_NUMBER: Final = 1e15
-
-
-def _norm(v: Array) -> Array:
-    squared = jnp.sum(v**2)
-    at_zero = squared == 0  # the root is kept away from 0 in both branches, since the gradient of `where` runs through both
-    return jnp.where(at_zero, 0, jnp.sqrt(jnp.where(at_zero, 1, squared)))
 
 
 class _Operation(NamedTuple):
@@ -72,7 +67,7 @@ class _Operation(NamedTuple):
 
 _FUNCTIONS: Final[Mapping[str, _Operation]] = {
     "norm2": _Operation("v", lambda v: jnp.sum(v**2)),
-    "norm": _Operation("v", _norm),
+    "norm": _Operation("v", safe_norm),
     "dot": _Operation("vv", jnp.dot),
     "sum": _Operation("v", jnp.sum),
     **{

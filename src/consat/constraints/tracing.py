@@ -60,7 +60,7 @@ def interpret(
     env.update(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
 
     def read(atom: Any) -> T:
-        return constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, core.Literal) else env[atom]
+        return constant(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if isinstance(atom, core.Literal) else env[atom]
 
     for eqn in closed.jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]

@@ -18,6 +18,6 @@ ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {rounds.name: rounds for rou
 """What ``--protocol`` may say of rounds."""
 
 __all__ = [
-    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Links", "Local", "MaxMin", "ProportionalIntegral", "Proximal", "Rounds", "Selfish", "Solver",
-    "State",
+    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Links", "Local", "MaxMin", "ProportionalIntegral", "Proximal", "Rounds", "Selfish",
+    "Solver", "State",
 ]  # fmt: skip

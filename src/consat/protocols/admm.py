@@ -13,8 +13,9 @@ reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -63,9 +64,9 @@ class Admm:
     quickening: float = 0.002
     horizon: float = 150.0
     name = "admm"
-    per = AdmmState(x="row", u="link", wish="row", heard="link", penalty="link", memory="agent")
+    per: ClassVar[Mapping[str, Any]] = {"x": "row", "u": "link", "wish": "row", "heard": "link", "penalty": "link", "memory": "agent"}
 
-    def earliest(self, solver: Solver) -> int:  # noqa: ARG002
+    def earliest(self, solver: Solver) -> int:
         return 0
 
     def start(self, x: Array, solver: Solver) -> AdmmState:
@@ -91,7 +92,7 @@ class Admm:
         wish = wish + jnp.clip(goal - wish, -most, most)
         return AdmmState(x, u, wish, state.heard, penalty, memory), (2 * links.at(x) - u, links.at(wish))
 
-    def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:  # noqa: ARG002
+    def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:
         q, wish = message
         u = jnp.where(arrived[:, None], (1 - self.relaxation) * state.u + self.relaxation * q, state.u)
         return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))

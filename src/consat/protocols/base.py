@@ -6,6 +6,7 @@ the functions cannot tell, because nothing in their arguments speaks of another 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from jax import Array
@@ -141,7 +142,7 @@ class Rounds(Protocol):
     """A protocol in rounds. In each, an agent speaks once, then hears what arrives."""
 
     @property
-    def per(self) -> Any:
+    def per(self) -> Mapping[str, Any]:
         """For each field of the state, what it has one of: ``row``, ``link`` or ``agent``."""
         ...
 

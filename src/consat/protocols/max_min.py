@@ -1,14 +1,15 @@
 """Exact max-min: relaxed ADMM while ν rises, so that the maximiser of the smooth margin β becomes that of the margin β̄.
 
-In stage s the agents minimise  Σ_i e^{−ν_s (α_i − t)} / 2^s  with ν_s = 2^s ν, where t, the margin of the team in
-the last stage, keeps the numbers near one. Agents find t by min-consensus: each passes on the smallest ᾱ_j it has heard of in its stage,
-and learns no more than that; a stage lasts long enough for the smallest to reach everyone. β̄* − β̄ ≤ (ln N + ln m̄)/ν_s (paper, eq. 12) halves with every stage.
+In stage s the agents minimise  Σ_i e^{−ν_s (α_i − t)} / 2^s  with ν_s = 2^s ν, where t, the margin of the team in the last stage, keeps
+the numbers near one. They find t by min-consensus: each passes on the smallest ᾱ_j it has heard of in its stage, and learns no more than
+that; a stage lasts long enough for the smallest to reach everyone. β̄* − β̄ ≤ (ln N + ln m̄)/ν_s (paper, eq. 12) halves with every stage.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -45,9 +46,9 @@ class MaxMin:
 
     stage: int = 20
     stages: int = 10
-    admm: Admm = Admm(pace=0.2, quickening=0.0)
+    admm: Admm = field(default=Admm(pace=0.2, quickening=0.0))
     name = "max-min"
-    per = MaxMinState(x="row", admm=Admm.per, heard="agent", level="agent")
+    per: ClassVar[Mapping[str, Any]] = {"x": "row", "admm": Admm.per, "heard": "agent", "level": "agent"}
 
     def earliest(self, solver: Solver) -> int:
         return self.stages * (self.stage + solver.hops)

@@ -10,8 +10,9 @@ integrate different differences, so that Σ z drifts. `consat.protocols.admm` is
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -46,15 +47,15 @@ class Proximal:
 
     step: float = 0.3
     name = "proximal"
-    per = ProximalState(x="row", z="row", heard="link", memory="agent")
+    per: ClassVar[Mapping[str, Any]] = {"x": "row", "z": "row", "heard": "link", "memory": "agent"}
 
-    def earliest(self, solver: Solver) -> int:  # noqa: ARG002
+    def earliest(self, solver: Solver) -> int:
         return 0
 
     def start(self, x: Array, solver: Solver) -> ProximalState:
         return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
 
-    def speak(self, state: ProximalState, solver: Solver, round_: Array) -> tuple[ProximalState, Array]:  # noqa: ARG002
+    def speak(self, state: ProximalState, solver: Solver, round_: Array) -> tuple[ProximalState, Array]:
         links = solver.links
         spread = links.sum(links.metropolis[:, None] * (links.at(state.x) - state.heard))
         x, memory, _ = solver.prox(state.x - spread - state.z, self._kappa(state.x, solver), state.x, state.memory)
@@ -63,5 +64,5 @@ class Proximal:
     def _kappa(self, x: Array, solver: Solver) -> Array:
         return jnp.zeros(len(x)) + 1.0 / (self.step * solver.length**2)
 
-    def hear(self, state: ProximalState, message: Array, arrived: Array, solver: Solver) -> ProximalState:  # noqa: ARG002
+    def hear(self, state: ProximalState, message: Array, arrived: Array, solver: Solver) -> ProximalState:
         return state._replace(heard=jnp.where(arrived[:, None], message, state.heard))

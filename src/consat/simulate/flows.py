@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +37,6 @@ MOST_STEPS = 100_000
 """Solver steps between two looks, after which a flow counts as too stiff."""
 MOST_NUMBERS = 1000
 """Estimates and integral states are recorded by default while there are at most this many numbers in each."""
-
-
 
 
 @jax.tree_util.register_dataclass
@@ -88,11 +87,11 @@ class Everyone:
 class Observed(NamedTuple):
     """What an observer of the whole team sees; leading axis T."""
 
-    position: Array
-    velocity: Array
-    margin: Array
-    smooth_margin: Array
-    agent_margin: Array
+    position: Any
+    velocity: Any
+    margin: Any
+    smooth_margin: Any
+    agent_margin: Any
 
 
 def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> State:
@@ -107,7 +106,7 @@ def _advance() -> Callable[[Flow, Problem, State, Array], tuple[State, Array]]:
     import diffrax
     import optimistix
 
-    def solver(numbers: int) -> diffrax.AbstractSolver:
+    def solver(numbers: int) -> diffrax.AbstractSolver[Any]:
         if numbers > MOST_IMPLICIT:
             return diffrax.Tsit5()
         # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
@@ -115,7 +114,7 @@ def _advance() -> Callable[[Flow, Problem, State, Array], tuple[State, Array]]:
 
     def advance(flow: Flow, problem: Problem, state: State, times: Array) -> tuple[State, Array]:
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, _: rate(flow, problem, t, y)),
+            diffrax.ODETerm(lambda t, y, _: rate(flow, problem, jnp.asarray(t), y)),
             solver(state.x.size + state.z.size),
             t0=times[0],
             t1=times[-1],
@@ -184,7 +183,7 @@ def simulate_flow(
                 times = grid[begin : begin + CHUNK + 1]
                 padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
                 states, fine = _advance()(flow, recorder.problem, state, jnp.asarray(padded))
-                states = jax.tree.map(lambda leaf, kept=len(times) - 1: leaf[:kept], states)
+                states = jax.tree.map(operator.itemgetter(slice(len(times) - 1)), states)
                 recorder.look(times[1:], states)
                 state = jax.tree.map(lambda leaf: leaf[-1], states)
                 progress(times[-1] / end, recorder.margin[-1])
@@ -194,10 +193,10 @@ def simulate_flow(
                 if stop == "satisfied" and recorder.satisfied_for(HOLD):
                     ending = "satisfied"
                     break
-                if stop != "never" and times[-1] >= schedule.duration + HOLD and recorder.settled(HOLD):
-                    if stop == "converged" or infeasible(recorder.position[-1]):
-                        ending = "settled"
-                        break
+                settled = stop != "never" and times[-1] >= schedule.duration + HOLD and recorder.settled(HOLD)
+                if settled and (stop == "converged" or infeasible(recorder.position[-1])):
+                    ending = "settled"
+                    break
         except KeyboardInterrupt:
             ending = "interrupted"
     return recorder.trace(estimates, ending, clock.seconds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -110,7 +110,7 @@ class Everyone:
         self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[Array, prox.Memory, Array]:
         nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.batches, nu, nu.beta * above - jnp.log(sharper), v, kappa, x, memory, TOLERANCE)
+        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
@@ -153,13 +153,13 @@ class Body:
 class Seen(NamedTuple):
     """What an observer of the whole team sees after each round; leading axis T."""
 
-    position: Array
-    margin: Array
-    smooth_margin: Array
-    agent_margin: Array
-    estimate: Array
-    messages: Array
-    floats: Array
+    position: Any
+    margin: Any
+    smooth_margin: Any
+    agent_margin: Any
+    estimate: Any
+    messages: Any
+    floats: Any
 
 
 @jax.tree_util.register_dataclass
@@ -232,10 +232,12 @@ def _where_awake(protocol: Rounds, world: _World, awake: Array, new: Any, old: A
     """The new state of those awake, the old one of those asleep."""
     masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
 
-    def choose(per: str, fresh: Any, stale: Any) -> Any:
-        return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
+    def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
+        if isinstance(per, str):
+            return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
+        return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
 
-    return jax.tree.map(choose, protocol.per, new, old)
+    return choose(protocol.per, new, old)
 
 
 def _rounds(protocol: Rounds, world: _World, now: _Now, numbers: Array) -> tuple[_Now, Seen]:
@@ -296,7 +298,7 @@ def simulate_rounds(
     """
     weather = weather or Weather()
     end = PATIENCE if rounds is None else rounds
-    world = _world(team, copies, nu, length, convex, weather, body, record)
+    world = _world(team, copies, nu, length, convex=convex, weather=weather, body=body, record=record)
     seen: list[Seen] = []
     ending: Ending = "out of time"
     done = 0
@@ -324,7 +326,7 @@ def simulate_rounds(
 
 
 def _world(
-    team: Team, copies: Estimates, nu: Nu, length: float, convex: bool, weather: Weather, body: Body | None, record: bool | None
+    team: Team, copies: Estimates, nu: Nu, length: float, *, convex: bool, weather: Weather, body: Body | None, record: bool | None
 ) -> _World:
     ends = Ends.of(copies)
     everyone = Everyone(
@@ -380,9 +382,7 @@ def _ending(
     return "settled" if settled and (stop == "converged" or hopeless(position[-1])) else None
 
 
-def _trace(
-    seen: Seen, world: _World, copies: Estimates, ending: Ending, body: Body | None, seconds: dict[str, float]
-) -> Trace:
+def _trace(seen: Seen, world: _World, copies: Estimates, ending: Ending, body: Body | None, seconds: dict[str, float]) -> Trace:
     steps = np.arange(len(seen.margin))
     dt = 1.0 if body is None else 1.0 / body.rate
     velocity = np.diff(seen.position, axis=0, append=seen.position[-1:]) / dt

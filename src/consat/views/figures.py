@@ -51,9 +51,8 @@ def marker(agent: int) -> str:
 
 
 def plain(text: str, longest: int = 34) -> str:
-    """A name as matplotlib should show it: dollars are no mathematics, a leading underscore doesn't hide it from a legend."""
-    short = text if len(text) <= longest else text[: longest - 1] + "…"
-    return (" " if short.startswith("_") else "") + short.replace("$", r"\$")
+    """A name as matplotlib should show it: short, and its dollars are no mathematics."""
+    return (text if len(text) <= longest else text[: longest - 1] + "…").replace("$", r"\$")
 
 
 @functools.partial(jax.jit, static_argnames="psi")

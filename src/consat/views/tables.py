@@ -37,7 +37,8 @@ def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield table
     if len(constraints) > MOST_ROWS:
         yield f"  … and {len(constraints) - MOST_ROWS} more; --json lists all"
-    yield f"convex: {ANSWER[findings['convex']]}   one optimum: {ANSWER[findings['unique_optimum']]}   bounded: {ANSWER[findings['bounded']]}"
+    facts = ("convex", "convex"), ("one optimum", "unique_optimum"), ("bounded", "bounded")
+    yield "   ".join(f"{words}: {ANSWER[findings[key]]}" for words, key in facts)
     for assumption in findings["assumptions"]:
         yield f"Assumption {assumption['number']}: {ANSWER[assumption['holds']]}. {escape(assumption['what'])}"
         if assumption["cure"]:
