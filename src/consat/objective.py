@@ -198,5 +198,6 @@ def weigh(observer: Objective, x: Array, nu: Nu) -> tuple[Array, Array]:
 def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, float]:
     """The paper's interval β ≤ β̄ ≤ β + ln(N)/ν_β + ln(m̄)/ν_α (eq. 11), at one formation; over agents that have constraints."""
     sizes = team.constraints_per_agent
-    slack = math.log(max(np.count_nonzero(sizes), 1)) / float(nu.beta) + math.log(max(int(sizes.max()) if len(sizes) else 1, 1)) / float(nu.alpha)
+    owners, most = max(int(np.count_nonzero(sizes)), 1), max([1, *sizes[sizes > 0].tolist()])
+    slack = math.log(owners) / float(nu.beta) + math.log(most) / float(nu.alpha)
     return smooth_margin, smooth_margin + slack

@@ -249,9 +249,10 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "smooth_margin": _number(trace.smooth_margin[-1]),
         "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
         "satisfied_from": {
-            "time": trace.satisfied_from if trace.clock == "time" else None,
-            "round": trace.satisfied_from if trace.clock == "round" else None,
+            "time": None if trace.satisfied_from is None or trace.period is None else trace.satisfied_from * trace.period,
+            "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
         },
+        "known_from": trace.known_from,
         "rounds": len(trace.steps) - 1 if trace.clock == "round" else None,
         "time": float(trace.steps[-1]) if trace.clock == "time" else None,
         "ending": trace.ending,

@@ -33,7 +33,9 @@ class Trace:
         satisfied_from: the first step after the last one whose margin was ≤ 0; None if the last margin is.
         messages: sent in all; None in continuous time.
         floats_sent: likewise.
+        known_from: the round from which every agent knew that all were satisfied; None in continuous time, or if they don't.
         seconds: spent on ``compile`` and ``run``.
+        period: seconds from one step of the clock to the next: 1 in continuous time; None where rounds take no time.
     """
 
     clock: Literal["time", "round"]
@@ -52,7 +54,9 @@ class Trace:
     satisfied_from: float | None
     messages: int | None
     floats_sent: int | None
+    known_from: int | None
     seconds: Mapping[str, float]
+    period: float | None = None
 
 
 def satisfied_from(steps: np.ndarray, margin: np.ndarray, *, interpolate: bool) -> float | None:

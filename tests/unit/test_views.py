@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cbook import is_math_text
 from matplotlib.colors import to_hex
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
@@ -27,7 +29,7 @@ from consat.objective import Nu, Objective
 from consat.result import Result
 from consat.team import Team
 from consat.trace import Trace, satisfied_from
-from consat.views import animation, figures, words
+from consat.views import animation, figures, scene, words
 
 GREETING = np.array([[2.0, 0.0], [-0.6, 0.0], [-2.0, 0.0]])
 
@@ -72,7 +74,7 @@ def made(
     estimate = x[:, held] * (1 + 0.1 * holder[:, None]) if copies else None
     trace = Trace(
         clock, steps, x, 0 * x, margin, smooth, own, estimate, None if estimate is None else 0.5 * estimate, holder, held,
-        np.zeros(count, dtype=int), "settled", since, None, None, {"compile": 0.0, "run": 0.0},
+        np.zeros(count, dtype=int), "settled", since, None, None, None, {"compile": 0.0, "run": 0.0},
     )  # fmt: skip
     entries = {
         agent: {
@@ -111,7 +113,7 @@ def vertices(edge: QuadContourSet) -> np.ndarray:
 def cell(figure: Figure) -> float:
     """The width of a cell of the grid on which ψ was evaluated."""
     axes = figure.axes[0]
-    return max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())) / (animation.GRID - 1)
+    return max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())) / (scene.GRID - 1)
 
 
 def legend(figure: Figure) -> list[str]:
@@ -135,6 +137,7 @@ def test_boundary_of_a_region_is_its_circle_whoever_wrote_it(letter: str) -> Non
     [edge] = boundaries(figure)
     error = np.abs(np.linalg.norm(vertices(edge) - center, axis=1) - 1.5)
     assert len(vertices(edge)) > 100
+    assert figure.axes[0].get_aspect() == 1
     # Between grid points the contour interpolates: ψ'' = −2 along each axis errs by h²/4, and |∇ψ| = 2r.
     assert error.max() <= cell(figure) ** 2 / (8 * 1.5) * 1.01
 
@@ -371,8 +374,9 @@ def test_nothing_is_cut_off_and_the_legend_covers_nothing(page: str, draw: Any) 
 def test_names_are_shown_as_they_are_written() -> None:
     team, end = PAGES["names"]
     figure = figures.formation(made(team, end))
-    shown = [text.get_text().strip().replace(r"\$", "$") for text in figure.axes[0].get_legend().get_texts()]
-    assert shown[:4] == ["_hidden", "pay$1$now", "an-agent-with…", "ü"]
+    shown = legend(figure)
+    assert not any(is_math_text(text) for text in shown)
+    assert [text.replace(r"\$", "$") for text in shown[:4]] == ["_hidden", "pay$1$now", "an-agent-with…", "ü"]
 
 
 def test_beyond_three_dimensions_the_title_says_what_is_shown() -> None:
@@ -415,6 +419,17 @@ def test_without_a_display_show_says_what_to_do(caplog: pytest.LogCaptureFixture
     assert "writes them into a directory" in caplog.text
 
 
+def test_with_a_display_show_opens_every_figure() -> None:
+    pyplot.switch_backend("module://matplotlib.backends.backend_template")  # what an interactive one implements, without a window
+    try:
+        assert figures.show(made(tug(), GREETING)) == []
+        titles = [pyplot.figure(number).axes[0].get_title() for number in pyplot.get_fignums()]
+    finally:
+        pyplot.close("all")
+        pyplot.switch_backend("agg")
+    assert [title.split()[-1] for title in titles] == ["1", "team", "positions", "states"]
+
+
 # ---- the film
 
 
@@ -448,29 +463,29 @@ def test_film_is_a_gif() -> None:
 
 def test_scene_shows_what_is_between_samples() -> None:
     result = made(tug(), GREETING, clock="round", samples=9)
-    scene = animation.Scene(result)
-    scene.show(2.25)
+    shown = scene.Scene(result)
+    shown.show(2.25)
     x = result.data["position"].values
-    heads = [line for line in scene.axes.lines if line.get_zorder() == 5]
+    heads = [line for line in shown.axes.lines if line.get_zorder() == 5]
     assert np.concatenate([line.get_xydata() for line in heads]) == pytest.approx(0.75 * x[2] + 0.25 * x[3])
-    assert "round 2," in scene.axes.get_title()
-    edge = next(edge for edge in boundaries(scene.figure) if to_hex(edge.get_edgecolor()[0]) == figures.colour(1).lower())
-    assert np.linalg.norm(vertices(edge) - heads[0].get_xydata(), axis=1) == pytest.approx(3.0, abs=cell(scene.figure) ** 2)
+    assert "round 2," in shown.axes.get_title()
+    edge = next(edge for edge in boundaries(shown.figure) if to_hex(edge.get_edgecolor()[0]) == figures.colour(1).lower())
+    assert np.linalg.norm(vertices(edge) - heads[0].get_xydata(), axis=1) == pytest.approx(3.0, abs=cell(shown.figure) ** 2)
 
 
 def test_scene_leaves_nothing_behind() -> None:
-    scene = animation.Scene(made(tug(), GREETING))
-    scene.show(0)
-    before = len(scene.axes.get_children())
-    scene.show(0)
-    assert len(scene.axes.get_children()) == before
+    shown = scene.Scene(made(tug(), GREETING))
+    shown.show(0)
+    before = len(shown.axes.get_children())
+    shown.show(0)
+    assert len(shown.axes.get_children()) == before
 
 
 def test_film_dwells_on_what_moves() -> None:
-    scene = animation.Scene(made(tug(), GREETING, samples=400))
-    moments = animation.moments(scene, 100, animation.MOVEMENT)
+    shown = scene.Scene(made(tug(), GREETING, samples=400))
+    moments = scene.moments(shown, 100, animation.MOVEMENT)
     assert moments[0] == 0
-    assert moments[-1] == scene.last
+    assert moments[-1] == shown.last
     assert np.all(np.diff(moments) > 0)
     assert np.count_nonzero(moments < 80) > 65  # by then all but e⁻⁴ of the way is done, in a fifth of the time
 
@@ -498,7 +513,7 @@ def test_words_of_an_infeasible_run() -> None:
     assert "infeasible: proven" in text
     assert "not at the end of the run" in text
     assert "59 rounds, 12,345 messages, 24,690 numbers sent" in text
-    assert "a2: near(a3) 0.4" in text
+    assert "  binding         a2: near(a3) 0.4" in text
 
 
 @pytest.mark.parametrize("status", words.STATUS)

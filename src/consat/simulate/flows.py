@@ -264,5 +264,6 @@ class _Recorder:
             satisfied_from=satisfied_from(steps, margin, interpolate=True),
             messages=None,
             floats_sent=None,
+            known_from=None,
             seconds=seconds,
         )

@@ -17,7 +17,7 @@ from consat.estimates import Estimates
 from consat.graphs import hops
 from consat.numerics import CompileClock, Groups, float64, quick_compilation
 from consat.objective import Nu, Objective
-from consat.protocols import Rounds
+from consat.protocols import Rounds, agreement
 from consat.simulate import Stop
 from consat.team import Team
 from consat.trace import Ending, Trace, satisfied_from
@@ -158,6 +158,7 @@ class Seen(NamedTuple):
     smooth_margin: Any
     agent_margin: Any
     estimate: Any
+    known: Any
     messages: Any
     floats: Any
 
@@ -196,6 +197,7 @@ class _World:
 
 class _Now(NamedTuple):
     state: Any
+    ages: agreement.Ages
     body: Array
     key: Array
 
@@ -203,32 +205,36 @@ class _Now(NamedTuple):
 def _round(protocol: Rounds, world: _World, now: _Now, round_: Array) -> tuple[_Now, Seen]:
     everyone, ends = world.everyone, world.everyone.links
     spoken, message = protocol.speak(now.state, everyone, round_)
+    ages, told = agreement.speak(now.ages, spoken.x, everyone)
     arrived = jnp.ones(len(ends.row), dtype=bool)
     key, sent, copies_sent = now.key, jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
     if world.rough:
         key, draw_loss, draw_sleep = jax.random.split(now.key, 3)
         awake = jax.random.uniform(draw_sleep, (everyone.agents,)) >= world.sleep
-        spoken = _where_awake(protocol, world, awake, spoken, now.state)
+        spoken = _where_awake(protocol.per, world, awake, spoken, now.state)
+        ages = _where_awake({"age": "agent", "heard": "link"}, world, awake, ages, now.ages)
         goes = awake[world.talker]
         sent = jnp.sum(jax.ops.segment_max(goes.astype(int), world.pair, world.pairs))
         copies_sent = jnp.sum(goes)
         arrived = (goes & (jax.random.uniform(draw_loss, (world.pairs,)) >= world.loss)[world.pair])[ends.other]
     state = protocol.hear(spoken, jax.tree.map(lambda leaf: leaf[ends.other], message), arrived, everyone)
+    ages = agreement.hear(ages, told[ends.other], arrived)
     target = state.x[world.own]
     away = target - now.body
     distance = jnp.linalg.norm(away, axis=1, keepdims=True)
     body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
-    floats = copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
-    return _Now(state, body, key), _see(world, state.x, body, sent, floats)
+    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
+    known = jnp.all(agreement.known(ages, everyone))
+    return _Now(state, ages, body, key), _see(world, state.x, body, known, sent, floats)
 
 
-def _see(world: _World, x: Array, body: Array, messages: Array, floats: Array) -> Seen:
+def _see(world: _World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
     margins = world.observer.agent_margins(body)
     smooth = world.observer.smooth_margin(body, world.everyone.nu)
-    return Seen(body, jnp.min(margins), smooth, margins, x if world.record else x[:0], messages, floats)
+    return Seen(body, jnp.min(margins), smooth, margins, x if world.record else x[:0], known, messages, floats)
 
 
-def _where_awake(protocol: Rounds, world: _World, awake: Array, new: Any, old: Any) -> Any:
+def _where_awake(per: Mapping[str, Any], world: _World, awake: Array, new: Any, old: Any) -> Any:
     """The new state of those awake, the old one of those asleep."""
     masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
 
@@ -237,7 +243,7 @@ def _where_awake(protocol: Rounds, world: _World, awake: Array, new: Any, old: A
             return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
         return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
 
-    return choose(protocol.per, new, old)
+    return choose(per, new, old)
 
 
 def _rounds(protocol: Rounds, world: _World, now: _Now, numbers: Array) -> tuple[_Now, Seen]:
@@ -246,8 +252,8 @@ def _rounds(protocol: Rounds, world: _World, now: _Now, numbers: Array) -> tuple
 
 def _begin(protocol: Rounds, world: _World, first: Array, key: Array) -> tuple[_Now, Seen]:
     start = first[world.own]
-    now = _Now(protocol.start(first, world.everyone), start, key)
-    return now, jax.tree.map(lambda leaf: leaf[None], _see(world, first, start, jnp.asarray(0), jnp.asarray(0)))
+    now = _Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key)
+    return now, jax.tree.map(lambda leaf: leaf[None], _see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0)))
 
 
 @functools.cache
@@ -364,6 +370,13 @@ def _satisfied_at(margin: np.ndarray) -> int:
     return int(whole[0]) + HOLD - 1 if len(whole) else -1
 
 
+def _for_good(known: np.ndarray) -> int | None:
+    """The round from which on everybody knew, or None."""
+    unknown = np.flatnonzero(~known)
+    since = int(unknown[-1]) + 1 if len(unknown) else 0
+    return since if since < len(known) else None
+
+
 def _ending(
     seen: list[Seen], stop: Stop, length: float, settle: bool, hopeless: Callable[[np.ndarray], bool],
     enough: Callable[[np.ndarray], bool] | None,
@@ -403,5 +416,7 @@ def _trace(seen: Seen, world: _World, copies: Estimates, ending: Ending, body: B
         satisfied_from=satisfied_from(steps, seen.margin, interpolate=False),
         messages=int(seen.messages.sum()),
         floats_sent=int(seen.floats.sum()),
+        known_from=_for_good(seen.known),
         seconds=seconds,
+        period=None if body is None else dt,
     )

@@ -135,7 +135,7 @@ def formation(result: Result, axes: Any = None) -> Figure:
         result: of a run.
         axes: what to draw on, 3-D axes for a team in space; if None, a new figure.
     """
-    from consat.views.animation import Scene  # a still is the last moment of a film
+    from consat.views.scene import Scene  # a still is the last moment of a film
 
     scene = Scene(result, axes)
     scene.show(scene.last)
@@ -175,6 +175,7 @@ def _chart(result: Result, title: str, ylabel: str) -> tuple[Figure, Axes, str]:
     clock = str(result.data["margin"].dims[0])
     first, last = result.data[clock].values[[0, -1]]
     axes.set(xlabel="time t [s]" if clock == "time" else "round", xlim=(first, last if last > first else first + 1))
+    axes.locator_params("x", integer=clock == "round")
     axes.grid(color="0.92", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes, clock
