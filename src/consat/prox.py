@@ -216,7 +216,7 @@ def solve(level: Level, v: Array, kappa: Array, guess: Guess, tolerance: Array |
         blur = jnp.abs(matrix) @ rounding
         if not convex:
             values, vectors = jnp.linalg.eigh(matrix)
-            matrix = (vectors * jnp.maximum(jnp.abs(values), jnp.min(k))) @ vectors.T
+            matrix = (vectors * jnp.maximum(jnp.abs(values), jnp.min(k))[None, :]) @ vectors.T
         solved = jnp.linalg.solve(matrix, jnp.stack([-residual, -push], axis=1))
         descend, follow = solved[:, 0], solved[:, 1]
 

@@ -236,6 +236,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     margin = _number(margins.min(initial=np.inf))
     certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
+    period = 1.0 if trace.clock == "time" else trace.period
     return {
         "schema": SCHEMA,
         "scenario": scenario.name,
@@ -249,7 +250,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "smooth_margin": _number(trace.smooth_margin[-1]),
         "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
         "satisfied_from": {
-            "time": None if trace.satisfied_from is None or trace.period is None else trace.satisfied_from * trace.period,
+            "time": None if trace.satisfied_from is None or period is None else trace.satisfied_from * period,
             "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
         },
         "known_from": trace.known_from,

@@ -35,7 +35,7 @@ class Trace:
         floats_sent: likewise.
         known_from: the round from which every agent knew that all were satisfied; None in continuous time, or if they don't.
         seconds: spent on ``compile`` and ``run``.
-        period: seconds from one step of the clock to the next: 1 in continuous time; None where rounds take no time.
+        period: of a round, s; None in continuous time, and where rounds take no time.
     """
 
     clock: Literal["time", "round"]

@@ -191,7 +191,7 @@ def arranged(nodes: Sequence[Node], index: Array) -> Node:
         together = flat[0] if len(flat) == 1 else np.concatenate(flat, axis=1)
         return np.take(together, index, axis=1) if index.ndim else together[:, int(index)]
 
-    degree = _highest(node.degree for node in nodes)
+    degree = highest(node.degree for node in nodes)
     low, high = pool(*(node.low for node in nodes)), pool(*(node.high for node in nodes))
     made = ("arranged", tuple(nodes))
     known = [node.terms for node in nodes if node.terms is not None]
@@ -209,7 +209,8 @@ def _term(node: Node, terms: tuple[Array, ...], order: int) -> Array:
     return terms[order] if order < len(terms) else np.zeros((1,) * (1 + len(node.shape) + 2 * order))
 
 
-def _highest(degrees: Iterable[int | None]) -> int | None:
+def highest(degrees: Iterable[int | None]) -> int | None:
+    """The largest, or None if one is unknown."""
     given = list(degrees)
     known = [degree for degree in given if degree is not None]
     return max(known) if len(known) == len(given) else None
@@ -229,7 +230,7 @@ def plus(a: Node, b: Node) -> Node:
         exponents = _shifted_exponents(logarithm, shift)
         if exponents is not None:
             return atom("log", fold(plus, atom("exp", exponents)))
-    degree, low, high = _highest((a.degree, b.degree)), a.low + b.low, a.high + b.high
+    degree, low, high = highest((a.degree, b.degree)), a.low + b.low, a.high + b.high
     if a.terms is not None and b.terms is not None:
         return Node(a.shape, degree, low, high, _sum(a.terms, b.terms), _sum(a.sizes, b.sizes))
     one, two = a.bend, b.bend

@@ -32,7 +32,7 @@ import numpy as np
 from jax.extend import core
 from numpy.typing import ArrayLike, NDArray
 
-from consat.constraints.composition import Node, arranged, block, constant, opaque, position, signs
+from consat.constraints.composition import Node, arranged, block, constant, highest, opaque, position, signs
 from consat.constraints.tracing import CALLS, describe, evaluate, interpret
 
 Array = NDArray[Any]
@@ -137,8 +137,8 @@ def read_curvatures(
     undecided = np.flatnonzero(code == _UNKNOWN)
     if undecided.size:
         code[undecided[_refuted(family, undecided)]] = _NOT
-    degrees = [node.degree for _, node in nodes]
-    return Readings(_LABELS[code], strict_in, None if None in degrees else max(each or 0 for each in degrees))
+    degrees = [None if node.terms is None else node.degree for _, node in nodes]
+    return Readings(_LABELS[code], strict_in, highest(degrees))
 
 
 def degree(psi: Psi, arity: int, dimension: int, example_parameters: Mapping[str, ArrayLike]) -> int | None:
