@@ -3,6 +3,7 @@
 import re
 import shlex
 import subprocess
+import sys
 import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
@@ -80,3 +81,9 @@ def test_scenarios_are_valid(document: Path, tmp_path: Path) -> None:
             file.write_text(block.text)
             done = subprocess.run([SCRIPTS / "consat", "check", file], capture_output=True, text=True, check=False)
             assert done.returncode == 0, f"{named(document)}, line {block.line}: {done.stderr}"
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=named)
+def test_examples_run(example: Path, tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, example], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
