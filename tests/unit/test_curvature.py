@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.constraints import apart, box, composition, constraint, curvature, displacement, expr, halfspace, near, outside, within
+from consat.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
 from consat.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
 from consat.constraints.functions import safe_norm
 
@@ -39,9 +39,9 @@ def _values(constraint: Any) -> dict[str, Any]:
         (lambda d: box(-np.ones(d), np.ones(d))[0], CONCAVE, (False,), 1),
         (lambda d: box(-np.ones(d), np.ones(d))[-1], CONCAVE, (False,), 1),
         (lambda d: expr("2**2 - norm2(a2 - a3)"), CONCAVE, (True, True), 2),
-        (lambda d: constraint(lambda x, y: 2 - safe_norm(x - y), ("i", "j")), CONCAVE, (False, False), None),
-        (lambda d: constraint(lambda x, y: safe_norm(x - y) - 2, ("i", "j")), NOT, (False, False), None),
-        (lambda d: constraint(lambda x, y: 4 - safe_norm(x - y) ** 2, ("i", "j")), CONCAVE, (True, True), 2),
+        (lambda d: expr("2 - norm(a2 - a3)"), CONCAVE, (False, False), None),
+        (lambda d: expr("norm(a2 - a3) - 2"), NOT, (False, False), None),
+        (lambda d: expr("4 - norm(a2 - a3)**2"), CONCAVE, (True, True), 2),
         (lambda d: expr("9 - norm2(a2) - log(exp(a2.x) + exp(a3.x))"), CONCAVE, (True, False), None),
         (lambda d: expr("2 - sqrt(norm2(a2) + 0.01)"), STRICTLY, (True,), None),
     ],
@@ -139,6 +139,7 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "abs of concave": (lambda x, a, b, c: -jnp.abs(1 - x @ x), NOT),
     "abs of positive": (lambda x, a, b, c: -jnp.abs(1 + x @ x), STRICTLY),
     "abs of negative": (lambda x, a, b, c: jnp.abs(-1 - x @ x), NOT),
+    "abs of W": (lambda x, a, b, c: -jnp.abs(jnp.abs(x[0]) - 1), NOT),
     "cube": (lambda x, a, b, c: -(x[0] ** 3), NOT),
     "cube of positive": (lambda x, a, b, c: -((x @ x + 1) ** 3), STRICTLY),
     "fourth power": (lambda x, a, b, c: -jnp.sum(x**4), CONCAVE),
@@ -158,9 +159,12 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "logistic of negative quadratic": (lambda x, a, b, c: -jax.nn.sigmoid(-(x @ x)), NOT),
     "atan, asinh of positive": (lambda x, a, b, c: jnp.arctan(jnp.sqrt(x[0])) + jnp.arcsinh(jnp.sqrt(x[1])), CONCAVE),
     "sinh of positive": (lambda x, a, b, c: -jnp.sinh(x @ x), STRICTLY),
+    "sinh": (lambda x, a, b, c: -jnp.sinh(x[0]), NOT),
+    "atan": (lambda x, a, b, c: jnp.arctan(x[0]), NOT),
     "cosh": (lambda x, a, b, c: -jnp.cosh(x[0]), CONCAVE),
     "sin": (lambda x, a, b, c: jnp.sin(x[0]), NOT),
     "sin of a constant": (lambda x, a, b, c: jnp.sin(a) * jnp.cos(b) * x[0], CONCAVE),
+    "low tide": (lambda x, a, b, c: jnp.minimum(-0.5, jnp.sin(x[0])), NOT),
     "sign": (lambda x, a, b, c: jnp.sign(x[0]), NOT),
     # of several numbers
     "min": (lambda x, a, b, c: jnp.minimum(1 - x @ x, 3 + x[0]), CONCAVE),
@@ -171,6 +175,8 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "min over entries": (lambda x, a, b, c: jnp.min(c - x), CONCAVE),
     "max over entries": (lambda x, a, b, c: a - jnp.max(jnp.abs(x)), CONCAVE),
     "clip": (lambda x, a, b, c: jnp.clip(x[0], -1.0, 1.0), NOT),
+    "clamp": (lambda x, a, b, c: jax.lax.clamp(-1.0, x[0], 1.0), NOT),
+    "clamp above": (lambda x, a, b, c: jax.lax.clamp(-9.0, jnp.sqrt(x[0]), 1.0), CONCAVE),
     "relu": (lambda x, a, b, c: -jax.nn.relu(x[0]), CONCAVE),
     "dominated max": (lambda x, a, b, c: jnp.maximum(-1.0, jnp.sqrt(x[0])), CONCAVE),
     "concave + strict": (lambda x, a, b, c: jnp.min(x) - x @ x, STRICTLY),
@@ -201,6 +207,10 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "atan2": (lambda x, a, b, c: jnp.arctan2(x[0], x[1]), NOT),
     "loop": (lambda x, a, b, c: jax.lax.fori_loop(0, 2, lambda i, s: s - x[0] ** 2, 0.0 * x[0]), UNKNOWN),
     "rounded": (lambda x, a, b, c: -jnp.floor(x[0]), NOT),
+    "where, in rounded numbers": (lambda x, a, b, c: (1e12 + jnp.where(x[0] > 0, -x[0], x[0])) - 1e12, UNKNOWN),
+    "whole numbers": (lambda x, a, b, c: (3.2 - jax.lax.div(jnp.int32(7), jnp.int32(2)).astype(float)) * jnp.abs(x[0]), NOT),
+    "out of bounds": (lambda x, a, b, c: -jnp.sum(x.at[jnp.array([0, 5])].get(mode="fill", fill_value=1e9) ** 2), UNKNOWN),
+    "not a number, nor a polynomial": (lambda x, a, b, c: jnp.sqrt(b) - jnp.abs(x[0]), UNKNOWN),
     "not a number": (lambda x, a, b, c: x[0] + jnp.sqrt(b), UNKNOWN),
     "infinite": (lambda x, a, b, c: -x[0] / (a - a), UNKNOWN),
 }
@@ -266,6 +276,18 @@ def test_members_are_read_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(whole[0].curvature) == [STRICTLY] * 5 + [CONCAVE] + [NOT] * 5 == list(parts[0].curvature)
     for one, other in zip(whole[1], parts[1], strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_parameters_that_select() -> None:
+    readings = read_curvatures(lambda x, k: jnp.where(k > 0, -(x[0] ** 2), x[0] ** 2), 1, 1, {"k": np.array([1.0, -1.0])})
+    assert list(readings.curvature) == [UNKNOWN, NOT]
+
+
+def test_exponents_differ() -> None:
+    readings = read_curvatures(lambda x, p: -((1 + x @ x) ** p), 1, 2, {"p": np.array([0.0, 1.0, 1.5, -0.5])})
+    assert list(readings.curvature[:3]) == [CONCAVE, CONCAVE, STRICTLY]  # the second strictly so, but not by a rule that fits all
+    assert readings.curvature[3] == NOT
+    assert readings.degree is None
 
 
 def test_family_without_parameters() -> None:
@@ -369,6 +391,14 @@ def test_far_from_the_origin() -> None:
     assert read_curvature(lambda x, c, r: r - safe_norm(x - c), 1, 2, parameters).curvature == CONCAVE
     assert read_curvature(lambda x, c, r: r - jnp.abs(jnp.sum((x - c) ** 2) - r**2), 1, 2, parameters).curvature == NOT
     assert read_curvature(lambda x, c, r: r - jnp.abs(x @ x - 2 * (c @ x) + c @ c - r**2), 1, 2, parameters).curvature != CONCAVE
+
+
+def test_sum_of_squares_is_convex_whatever_the_rounding() -> None:
+    """√ of 60 squares with offsets in the thousands: expanded, the constant term that makes it a cone drowns in rounding."""
+    rng = np.random.default_rng(0)
+    A, offsets = rng.normal(size=(60, 3)), rng.normal(size=60) * 10 ** rng.uniform(-3, 5, 60)
+    assert read_curvature(lambda x, A, b: -safe_norm(A @ x - b), 1, 3, {"A": A, "b": A @ rng.normal(size=3) * 1e6}).curvature == CONCAVE
+    assert read_curvature(lambda x, A, b: -safe_norm(A @ x - b), 1, 3, {"A": A, "b": offsets}).curvature != NOT
 
 
 def test_size_of_what_is_cancelled_matters() -> None:
