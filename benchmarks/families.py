@@ -15,6 +15,7 @@ import numpy as np
 
 import consat as cs
 from consat.settings import Smoothing
+import itertools
 
 Instance = tuple[list[cs.Agent], list[tuple[str, str]]]
 """Agents and links, all ids with the instance's prefix."""
@@ -87,7 +88,7 @@ def _diameter(pairs: Sequence[tuple[str, str]]) -> int:
 
 
 def _line(ids: Sequence[str]) -> list[tuple[str, str]]:
-    return list(zip(ids[:-1], ids[1:], strict=True))
+    return list(itertools.pairwise(ids))
 
 
 def _ids(prefix: str, count: int) -> list[str]:
@@ -117,7 +118,7 @@ def _case(letter: str) -> Builder:
 def _chain(prefix: str, count: int, random: np.random.Generator) -> Instance:
     """A leader in a disc, each follower near the one ahead; links follow the tasks."""
     ids = _ids(prefix, count)
-    followers = [cs.Agent(i, [cs.near(ahead, 1)]) for ahead, i in zip(ids[:-1], ids[1:], strict=True)]
+    followers = [cs.Agent(i, [cs.near(ahead, 1)]) for ahead, i in itertools.pairwise(ids)]
     return [cs.Agent(ids[0], [cs.within([2, 0], 1)]), *followers], _line(ids)
 
 
@@ -127,7 +128,7 @@ def _anchored(margin: float) -> Builder:
     def build(prefix: str, count: int, random: np.random.Generator) -> Instance:
         ids = _ids(prefix, count)
         half = 0.5 * (count + 1) * math.sqrt(1 - margin)  # N − 1 tethers and two discs of radius 1, all stretched to √(1 − margin)
-        agents = [cs.Agent(i, [cs.near(ahead, 1)]) for ahead, i in zip(ids[:-1], ids[1:], strict=True)]
+        agents = [cs.Agent(i, [cs.near(ahead, 1)]) for ahead, i in itertools.pairwise(ids)]
         agents[-1] = cs.Agent(ids[-1], [cs.near(ids[-2], 1), cs.within([half, 0], 1)])
         return [cs.Agent(ids[0], [cs.within([-half, 0], 1)]), *agents], _line(ids)
 

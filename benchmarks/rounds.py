@@ -281,7 +281,9 @@ def measure_peers(stage: Stage, boxes: Sequence[float], cap: int, steps: np.ndar
                 for lanes_ in (table.box == b, (table.box == b) & paper)
                 if lanes_[alive].any()
             ]
-            whole = [min(cap, RAMPED / step[lane]) if ramped[lane] else 0.0 for lane in best]  # a step must be stable to the end of the ramp
+            whole = [
+                min(cap, RAMPED / step[lane]) if ramped[lane] else 0.0 for lane in best
+            ]  # a step must be stable to the end of the ramp
             if all(np.isfinite(satisfied[k]).all() and done >= max(2 * satisfied[k].max(), w) for k, w in zip(best, whole, strict=True)):
                 break
         for b, box in enumerate(boxes):
@@ -370,7 +372,16 @@ def _twins(stages: Sequence[Stage]) -> str:
 def _others(stages: Sequence[Stage], boxes: Sequence[float]) -> str:
     methods = ("flow", "flow 0.01", "tracking", "extra")
     titles = ("sampled flow, best step", f"at h = {PAPER_STEP:g}", "gradient tracking", "EXTRA")
-    head = ["problem", "from", "admm", *titles, "flow ÷ admm", f"at h = {PAPER_STEP:g} ÷ admm", "floats, flow ÷ admm", "best step of the flow"]
+    head = [
+        "problem",
+        "from",
+        "admm",
+        *titles,
+        "flow ÷ admm",
+        f"at h = {PAPER_STEP:g} ÷ admm",
+        "floats, flow ÷ admm",
+        "best step of the flow",
+    ]
     rows = []
     for stage in stages:
         for box in boxes:
@@ -403,7 +414,9 @@ def _targets(stages: Sequence[Stage], compared: Sequence[Stage]) -> str:
         for flow, words in (("flow", "at its best step"), ("flow 0.01", f"at h = {PAPER_STEP:g}")):
             ratios = np.array([_ratio(s, box, flow=flow) for s in feasible])
             lost = int(np.sum(~np.isfinite(ratios)))
-            text = f"median {np.median(ratios):.0f}, least {ratios.min():.0f}; in {lost} of {len(ratios)} problems the flow is not satisfied"
+            text = (
+                f"median {np.median(ratios):.0f}, least {ratios.min():.0f}; in {lost} of {len(ratios)} problems the flow is not satisfied"
+            )
             rows.append((f"≥ 100 × fewer rounds than the flow sampled {words}, from {_box(box)}", text, bool(np.median(ratios) >= 100)))
     for family in ("chain", "grid"):
         for box in BOXES:

@@ -37,7 +37,7 @@ SCHEMA = "consat.run/1"
 SOLVE_SCHEMA = "consat.solve/1"
 MOST_LISTED = 10_000
 """Above this many agents the summary leaves out what it says of each."""
-SHARP = 2e-4
+SHARP = 5e-4
 """Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
 AT_REST = 1e-2
 """A team whose last positions moved by less than this, in its units of length, counts as arrived."""

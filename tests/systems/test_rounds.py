@@ -17,7 +17,6 @@ from consat.numerics import float64
 from consat.objective import Nu
 from consat.protocols import Admm, Proximal
 from consat.reference import max_min
-from consat.settings import Smoothing
 from consat.simulate.rounds import Weather, _world, simulate_rounds
 from tests.unit import teams
 
@@ -111,7 +110,7 @@ def test_admm_with_half_relaxation_and_fixed_penalty_is_p_extra() -> None:
     # Copies without links have a penalty of their own, ρ.
     rho = 2.0
     worst = _against_recursion(
-        Admm(relaxation=0.5, penalty=rho, pace=0.0, quickening=0.0),
+        Admm(relaxation=0.5, penalty=rho, rise=0.0, fall=0.0),
         lambda A, degree: np.where(degree[:, None] > 0, A / np.maximum(degree, 1)[:, None], np.eye(len(A))),
         lambda degree: rho * np.maximum(degree, 1.0),
         lambda W, x: W @ x - x,
@@ -180,9 +179,9 @@ def _check_max_min(team: cs.Team, known: float | None = None) -> None:
         assert best == pytest.approx(known, abs=1e-5)
     assert summary["margin"] == pytest.approx(best, abs=1e-3)
     assert summary["margin"] <= best + 1e-6  # the cone program's own tolerance
-    # stopped by the certificate: well before 2000 rounds, with a gap of SHARP = 2e-4 of ψ's scale, 1 at most, proven
+    # stopped by the certificate: well before 2000 rounds, with a gap of SHARP = 5e-4 of ψ's scale, 1 at most, proven
     assert summary["ending"] == "settled"
-    assert summary["bounds"][1] - summary["bounds"][0] <= 2e-4 + 1e-9
+    assert summary["bounds"][1] - summary["bounds"][0] <= 5e-4 + 1e-9
     assert summary["status"] == ("satisfied" if best > 0 else "least-violating")
 
 

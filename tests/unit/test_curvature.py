@@ -176,6 +176,7 @@ RULES: dict[str, tuple[Callable[..., Any], Curvature]] = {
     "max over entries": (lambda x, a, b, c: a - jnp.max(jnp.abs(x)), CONCAVE),
     "clip": (lambda x, a, b, c: jnp.clip(x[0], -1.0, 1.0), NOT),
     "clamp": (lambda x, a, b, c: jax.lax.clamp(-1.0, x[0], 1.0), NOT),
+    "clamp, negated": (lambda x, a, b, c: -jax.lax.clamp(-1.0, x[0], 1.0), NOT),
     "clamp above": (lambda x, a, b, c: jax.lax.clamp(-9.0, jnp.sqrt(x[0]), 1.0), CONCAVE),
     "relu": (lambda x, a, b, c: -jax.nn.relu(x[0]), CONCAVE),
     "dominated max": (lambda x, a, b, c: jnp.maximum(-1.0, jnp.sqrt(x[0])), CONCAVE),
@@ -393,12 +394,19 @@ def test_far_from_the_origin() -> None:
     assert read_curvature(lambda x, c, r: r - jnp.abs(x @ x - 2 * (c @ x) + c @ c - r**2), 1, 2, parameters).curvature != CONCAVE
 
 
-def test_sum_of_squares_is_convex_whatever_the_rounding() -> None:
-    """√ of 60 squares with offsets in the thousands: expanded, the constant term that makes it a cone drowns in rounding."""
+def test_norm_needs_no_eigenvalue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That a sum of squares is ≥ 0, hence its root a cone, follows from bounds alone, and so holds whatever the rounding."""
+    monkeypatch.setattr(composition, "_nonnegative", lambda q, *_: np.zeros(1, bool))
+    assert read_curvature(lambda x, y, c: 1 - safe_norm(x - y - c), 2, 3, {"c": np.array([1e7, 0.1, 1e-3])}).curvature == CONCAVE
+
+
+def test_norm_of_an_ellipse() -> None:
+    """No sum of squares to look at: here the matrix must be found semidefinite in spite of rounding, and of an offset of 1e6."""
     rng = np.random.default_rng(0)
-    A, offsets = rng.normal(size=(60, 3)), rng.normal(size=60) * 10 ** rng.uniform(-3, 5, 60)
-    assert read_curvature(lambda x, A, b: -safe_norm(A @ x - b), 1, 3, {"A": A, "b": A @ rng.normal(size=3) * 1e6}).curvature == CONCAVE
-    assert read_curvature(lambda x, A, b: -safe_norm(A @ x - b), 1, 3, {"A": A, "b": offsets}).curvature != NOT
+    root = rng.normal(size=(20, 3, 3))
+    parameters = {"P": root @ np.swapaxes(root, 1, 2), "c": rng.normal(size=(20, 3)) * 1e6}
+    readings = read_curvatures(lambda x, P, c: 1 - jnp.sqrt((x - c) @ P @ (x - c)), 1, 3, parameters)
+    assert list(readings.curvature) == [CONCAVE] * 20
 
 
 def test_size_of_what_is_cancelled_matters() -> None:

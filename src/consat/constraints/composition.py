@@ -486,7 +486,7 @@ def _composed(facts: Atom, a: Node) -> Node:
 def _cone(q: Node, bend: Bend) -> Bend:
     """√q for a quadratic q: convex iff q ≥ 0 everywhere, so that q = ‖affine‖² + constant; if the constant is positive, then strictly so
     wherever q is. Sums of squares show it by their bounds; for others the constant 0 must be recognised in spite of rounding."""
-    cone = (q.low >= 0) | _nonnegative(q, 0.0, 1e-14)
+    cone = (q.low >= 0) | _nonnegative(q, 0.0, 4e-15)
     smooth = _nonnegative(q, 1e-6) & (q.sizes[0] > 0)
     kind = np.arange(q.bend.strict.shape[-1]) < q.bend.strict.shape[-1] - 1
     strict = q.bend.strict & (smooth[..., None] | ~kind)

@@ -6,9 +6,10 @@ keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
     on receipt of q_ji:   u_ij ← (1 − a) u_ij + a q_ji             a lost message leaves u_ij as it was
 
 It converges under random loss and wake-ups from any u: there is no invariant to lose. The penalty of a link is the geometric mean of what
-its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest, and then each end moves
-ρ_i, slowly at first, towards the stiffness of its own f_i, where the optimum is reached soonest; a copy that no constraint of its holder
-reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays.
+its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest; then each end lets ρ_i rise
+slowly towards the stiffness of its own f_i, and fall towards it only once it knows that all are satisfied: by then the optimum is all that
+is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
+changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays.
 """
 
 from __future__ import annotations
@@ -52,17 +53,17 @@ class Admm:
         relaxation: a in (0, 1); above 1/2 is over-relaxed.
         penalty: ρ at the start, in 1/length².
         share: of the stiffness, that ρ_i moves towards.
-        pace: how far ln ρ_i may move in the first round, and …
-        quickening: … how much farther in each one after.
-        horizon: round after which the moves die out, so that ρ settles and convergence is that of fixed ρ.
+        rise: how much ln ρ_i may rise in a round.
+        fall: how much it may fall while a message crosses the team, once the agent knows that all are satisfied.
+        horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
     """
 
     relaxation: float = 0.7
     penalty: float = 10.0
     share: float = 0.3
-    pace: float = 0.05
-    quickening: float = 0.002
-    horizon: float = 150.0
+    rise: float = 0.02
+    fall: float = 0.2
+    horizon: float = 50.0
     name = "admm"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "u": "link", "wish": "row", "heard": "link", "penalty": "link", "memory": "agent"}
 
@@ -76,7 +77,7 @@ class Admm:
         return AdmmState(x, at_links, wish, level, level, solver.recall(x, jnp.exp(wish)))
 
     def speak(
-        self, state: AdmmState, solver: Solver, round_: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
+        self, state: AdmmState, solver: Solver, round_: Array, known: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[AdmmState, tuple[Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
@@ -88,8 +89,10 @@ class Admm:
         x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory, sharper, above)
         neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
         goal = jnp.where(jnp.isnan(stiffness), neighbours, jnp.log(self.share * stiffness + jnp.finfo(x.dtype).tiny))
-        most = (self.pace + self.quickening * round_) / (1.0 + (round_ / self.horizon) ** 4)
-        wish = wish + jnp.clip(goal - wish, -most, most)
+        since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
+        rise = self.rise / (1.0 + (round_ / horizon) ** 4)
+        fall = jnp.where(since > 0, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
+        wish = wish + jnp.clip(goal - wish, -fall, rise)
         return AdmmState(x, u, wish, state.heard, penalty, memory), (2 * links.at(x) - u, links.at(wish))
 
     def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:

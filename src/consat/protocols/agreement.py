@@ -48,5 +48,5 @@ def hear(ages: Ages, message: Array, arrived: Array) -> Ages:
 
 
 def known(ages: Ages, solver: Solver) -> Array:
-    """Whether each agent knows that all are satisfied."""
-    return ages.age > solver.hops
+    """For how many rounds each agent has known that all are satisfied; 0 while it doesn't."""
+    return jnp.maximum(ages.age - solver.hops, 0.0)

@@ -159,8 +159,15 @@ class Rounds(Protocol):
         """The state with which an agent begins from first estimates x; its field ``x`` holds its estimates from then on."""
         ...
 
-    def speak(self, state: Any, solver: Solver, round_: Array) -> tuple[Any, Any]:
-        """Its step, and its message: arrays with one row a link."""
+    def speak(self, state: Any, solver: Solver, round_: Array, known: Array) -> tuple[Any, Any]:
+        """Its step, and its message: arrays with one row a link.
+
+        Args:
+            state: own.
+            solver: own.
+            round_: which round it is, from 0.
+            known: for how many rounds it has known that all are satisfied, one number an agent; see `consat.protocols.agreement`.
+        """
         ...
 
     def hear(self, state: Any, message: Any, arrived: Array, solver: Solver) -> Any:

@@ -39,35 +39,43 @@ class MaxMin:
     """See the module.
 
     Attributes:
-        stage: rounds at each ν, beside those that a number needs to cross the team.
+        stage: rounds at each ν, and …
+        crossings: … as many more as a message needs to cross the team so many times.
         stages: how often ν doubles.
         admm: how each stage is solved.
     """
 
-    stage: int = 20
+    stage: int = 12
+    crossings: int = 4
     stages: int = 10
-    admm: Admm = field(default=Admm(pace=0.2, quickening=0.0))
+    admm: Admm = field(default=Admm(rise=0.1, fall=0.8))
     name = "max-min"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "admm": Admm.per, "heard": "agent", "level": "agent"}
 
     def earliest(self, solver: Solver) -> int:
-        return self.stages * (self.stage + solver.hops)
+        return self.stages * self._rounds(solver)
+
+    def _rounds(self, solver: Solver) -> int:
+        return self.stage + self.crossings * solver.hops
 
     def start(self, x: Array, solver: Solver) -> MaxMinState:
         margin = solver.margin(x)
         return MaxMinState(x, self.admm.start(x, solver), margin, jnp.zeros_like(margin))
 
-    def speak(self, state: MaxMinState, solver: Solver, round_: Array) -> tuple[MaxMinState, tuple[tuple[Array, Array], Array]]:
-        stage = self.stage + solver.hops
+    def speak(
+        self, state: MaxMinState, solver: Solver, round_: Array, known: Array
+    ) -> tuple[MaxMinState, tuple[tuple[Array, Array], Array]]:
+        stage = self._rounds(solver)
         number, within = jnp.floor(round_ / stage), round_ % stage
         turn = (number > 0) & (number <= self.stages) & (within == 0)
         level = jnp.where(turn, state.heard, state.level)
-        sharper = 2.0 ** jnp.minimum(number, self.stages)
-        admm, message = self.admm.speak(state.admm, solver, within, sharper, jnp.where(number > 0, level, 0.0))
+        sharper, above = 2.0 ** jnp.minimum(number, self.stages), jnp.where(number > 0, level, 0.0)
+        # penalties may fall throughout, and settle once the last stage is over
+        free = 1.0 + jnp.maximum(round_ - self.earliest(solver), 0.0) + jnp.zeros_like(known)
+        admm, message = self.admm.speak(state.admm, solver, within, free, sharper, above)
         margin = solver.margin(admm.x)
         # what was heard in the first half of a stage is of positions still on their way
-        fresh = within <= self.stage // 2
-        heard = jnp.where(fresh, margin, jnp.minimum(state.heard, margin))
+        heard = jnp.where(within <= stage // 2, margin, jnp.minimum(state.heard, margin))
         return MaxMinState(admm.x, admm, heard, level), (message, solver.links.at(solver.to_rows(heard)))
 
     def hear(self, state: MaxMinState, message: tuple[tuple[Array, Array], Array], arrived: Array, solver: Solver) -> MaxMinState:

@@ -55,7 +55,7 @@ class Proximal:
     def start(self, x: Array, solver: Solver) -> ProximalState:
         return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
 
-    def speak(self, state: ProximalState, solver: Solver, round_: Array) -> tuple[ProximalState, Array]:
+    def speak(self, state: ProximalState, solver: Solver, round_: Array, known: Array) -> tuple[ProximalState, Array]:
         links = solver.links
         spread = links.sum(links.metropolis[:, None] * (links.at(state.x) - state.heard))
         x, memory, _ = solver.prox(state.x - spread - state.z, self._kappa(state.x, solver), state.x, state.memory)

@@ -204,7 +204,7 @@ class _Now(NamedTuple):
 
 def _round(protocol: Rounds, world: _World, now: _Now, round_: Array) -> tuple[_Now, Seen]:
     everyone, ends = world.everyone, world.everyone.links
-    spoken, message = protocol.speak(now.state, everyone, round_)
+    spoken, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
     ages, told = agreement.speak(now.ages, spoken.x, everyone)
     arrived = jnp.ones(len(ends.row), dtype=bool)
     key, sent, copies_sent = now.key, jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
@@ -224,7 +224,7 @@ def _round(protocol: Rounds, world: _World, now: _Now, round_: Array) -> tuple[_
     distance = jnp.linalg.norm(away, axis=1, keepdims=True)
     body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
     floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
-    known = jnp.all(agreement.known(ages, everyone))
+    known = jnp.all(agreement.known(ages, everyone) > 0)
     return _Now(state, ages, body, key), _see(world, state.x, body, known, sent, floats)
 
 
