@@ -6,6 +6,7 @@ compiled program, and each is judged for itself.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,6 @@ import numpy as np
 
 import consat as cs
 from consat.settings import Smoothing
-import itertools
 
 Instance = tuple[list[cs.Agent], list[tuple[str, str]]]
 """Agents and links, all ids with the instance's prefix."""
