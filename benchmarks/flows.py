@@ -88,7 +88,7 @@ def batch(starts: int) -> None:
     problem = Problem.of(team, copies, Schedule.of(settings.smoothing))
     first = jnp.asarray(np.random.default_rng(0).uniform(-4, 4, (starts, copies.count, 2)))
     times = [jnp.asarray(part) for part in np.linspace(0, UNTIL, 3001)[np.arange(0, 3000, CHUNK)[:, None] + np.arange(CHUNK + 1)]]
-    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advance()(flow, problem, state, times))(states))
+    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advance().__wrapped__(flow, problem, state, times))(states))
 
     def singles() -> None:
         for x in first:

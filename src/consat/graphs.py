@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
-import networkx as nx
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from consat.errors import Fault, InvalidTeam
 from consat.team import Team
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 
 def task_edges(team: Team) -> np.ndarray:
@@ -152,6 +155,8 @@ def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> s
 
 def task_graph(team: Team) -> nx.DiGraph:
     """The task graph over ids, with self-edges."""
+    import networkx as nx
+
     graph = nx.DiGraph()
     graph.add_nodes_from(team.ids)
     graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in task_edges(team))
@@ -160,6 +165,8 @@ def task_graph(team: Team) -> nx.DiGraph:
 
 def communication_graph(team: Team) -> nx.Graph:
     """The communication graph over ids."""
+    import networkx as nx
+
     graph = nx.Graph()
     graph.add_nodes_from(team.ids)
     graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in team.links)

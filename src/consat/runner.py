@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
-from consat.assumptions import with_auxiliary
 from consat.certificate import BINDING, bounds
 from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates, Layout
@@ -20,8 +19,6 @@ from consat.numerics import float64
 from consat.objective import Objective, Schedule, weigh
 from consat.protocols import FLOWS, ROUNDS
 from consat.quadratics import shape_of
-from consat.reasons import explain
-from consat.reference import max_min
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
@@ -94,7 +91,7 @@ def run(
     """
     scenario = _scenario(team)
     if auxiliary is not None:
-        scenario = dataclasses.replace(scenario, team=with_auxiliary(scenario.team, auxiliary))
+        scenario = _with_auxiliary(scenario, auxiliary)
     asked = scenario.settings
     settings = asked.model_copy(
         update={
@@ -183,9 +180,12 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
     Returns:
         what ``consat solve --json`` prints (schema consat.solve/1), and ``reasons``: what binds or conflicts, in words.
     """
+    from consat.reasons import explain
+    from consat.reference import max_min
+
     scenario = _scenario(team)
     if auxiliary is not None:
-        scenario = dataclasses.replace(scenario, team=with_auxiliary(scenario.team, auxiliary))
+        scenario = _with_auxiliary(scenario, auxiliary)
     problem = scenario.team
     optimum = max_min(problem, seed=seed)
     certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
@@ -266,6 +266,12 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
     }
+
+
+def _with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
+    from consat.assumptions import with_auxiliary
+
+    return dataclasses.replace(scenario, team=with_auxiliary(scenario.team, radius))
 
 
 def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:

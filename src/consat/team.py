@@ -8,16 +8,18 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import jax
-import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter
 from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
 from consat.numerics import float64
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 LARGEST = 1e100
 """Numbers beyond this are refused: their squares must stay finite in float64."""
@@ -28,7 +30,7 @@ SUGGESTIONS = 20
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
 Path = tuple[str | int, ...]
-Links: TypeAlias = str | nx.Graph | Iterable[tuple[str, str]]
+Links: TypeAlias = "str | nx.Graph | Iterable[tuple[str, str]]"
 
 
 @dataclass(frozen=True)
@@ -398,7 +400,7 @@ def _pairs(links: Links, index: Mapping[str, int], faults: list[Fault]) -> np.nd
             faults.append(Fault(("communication", "graph"), f"there is no graph {links!r}; choose one of {choices}", "communication"))
         return None
     pairs = []
-    for k, link in enumerate(links.edges if isinstance(links, nx.Graph) else links):
+    for k, link in enumerate(getattr(links, "edges", links)):
         path: Path = ("communication", "links", k)
         ends = tuple(link) if isinstance(link, list | tuple) else (link,)
         where = f"communication link {k + 1}"
