@@ -109,6 +109,8 @@ def run(
 
     with _progress(quiet or as_json) as progress, _located(loaded):
         result = run_team(loaded, full=full, progress=progress, **settings)
+    if settings["auxiliary"] is not None:
+        _say_auxiliary(settings["auxiliary"], result.binding("auxiliary"))
     if out is not None:
         result.summary["result"] = str(out / "result.nc")
         result.save(out / "result.nc")
@@ -160,6 +162,8 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 
     with _located(loaded):
         answer = solve_team(loaded, seed=seed, auxiliary=auxiliary)
+    if answer["auxiliary"] is not None:
+        _say_auxiliary(answer["auxiliary"]["radius"], answer["auxiliary"]["binding"])
     if as_json:
         click.echo(json.dumps(answer))
     else:
@@ -235,6 +239,13 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, float | None], None]]:
             bar.update(task, completed=done, margin="" if margin is None else f"margin {margin:+.4g}")
 
         yield update
+
+
+def _say_auxiliary(radius: float, binding: list[str]) -> None:
+    _say(f"auxiliary constraint added: every agent stays within {radius:g} of the team's middle")
+    if binding:
+        few = ", ".join(binding[:5]) + (", …" if len(binding) > 5 else "")
+        _say(f"it binds on {few}: the answer is that of the changed team; take a larger radius")
 
 
 def _show(parts: Iterable[Any]) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 SCHEMA = "consat.result/1"
 AXES = ("x", "y", "z")
+SLIGHT = 1e-3
+"""A constraint with a smaller multiplier does not bind."""
 
 
 class Result:
@@ -56,6 +58,11 @@ class Result:
         from consat.scenario import loads
 
         return loads(self.scenario, name=self.summary["scenario"]).team
+
+    def binding(self, name: str) -> list[str]:
+        """The agents on whom their constraint of this name binds at the end of the run; empty where agents are not listed."""
+        agents = (self.summary["agents"] or {}).items()
+        return [agent for agent, told in agents if any(c["name"] == name and (c["multiplier"] or 0) > SLIGHT for c in told["constraints"])]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write NetCDF-4; `Result.load` reads it back without loss."""

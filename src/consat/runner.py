@@ -143,7 +143,8 @@ def _run(scenario: Scenario, settings: Settings, full: bool, simulate: Callable[
     copies, size = Estimates.of(team, settings.protocol.estimates), scale(team)
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
     trace = simulate(_Prepared(team, copies, schedule, size, first_estimates(team, copies, settings.start, size)))
-    return Result(summarise(scenario, settings, schedule, size, trace, full), trace=trace, team=team, scenario=scenario.text)
+    summary = summarise(scenario, settings, schedule, size, trace, full)
+    return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
 def _flow(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
@@ -202,6 +203,7 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
             if optimum.multipliers[k] > BINDING
         ],
         "method": optimum.method,
+        "auxiliary": None if auxiliary is None else _auxiliary(problem, auxiliary, optimum.multipliers),
         "reasons": explain(problem, optimum),
     }
 
@@ -272,6 +274,13 @@ def _with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
     from consat.assumptions import with_auxiliary
 
     return dataclasses.replace(scenario, team=with_auxiliary(scenario.team, radius))
+
+
+def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
+    """Says that the auxiliary constraint was added, and on whom it binds: then the radius is too small."""
+    from consat.assumptions import binding_auxiliaries
+
+    return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}
 
 
 def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
