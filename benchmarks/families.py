@@ -135,20 +135,25 @@ def _anchored(margin: float) -> Builder:
     return build
 
 
-def _grid(prefix: str, count: int, random: np.random.Generator) -> Instance:
-    """A lattice of unit pitch, each agent in its place beside its left and lower neighbours; one corner in a disc."""
+def _neighbours(count: int) -> list[tuple[int, int, list[int]]]:
+    """(i, j, step) for every agent i of a grid and its left and lower neighbours j, as nearly square as N allows."""
     height = max(h for h in range(1, math.isqrt(count) + 1) if count % h == 0)
     width = count // height
-    ids = _ids(prefix, count)
-    agents, links = [], []
-    for i in range(count):
-        own = [] if i else [cs.within([0, 0], 1)]
-        for j, step in ((i - 1, [1, 0]), (i - width, [0, 1])):
-            if j >= 0 and (step == [0, 1] or i % width):
-                own.append(cs.displacement(ids[j], step, 0.5))
-                links.append((ids[j], ids[i]))
-        agents.append(cs.Agent(ids[i], own))
-    return agents, links
+    beside = [(i, i - 1, [1, 0]) for i in range(count) if i % width]
+    return sorted([*beside, *((i, i - width, [0, 1]) for i in range(width, count))])
+
+
+def _meshed(tie: Callable[[str, list[int]], cs.Constraint]) -> Builder:
+    """A grid whose agents are tied to their left and lower neighbours; one corner in a disc; links follow the tasks."""
+
+    def build(prefix: str, count: int, random: np.random.Generator) -> Instance:
+        ids = _ids(prefix, count)
+        own: list[list[cs.Constraint]] = [[cs.within([2, 0], 1)], *([] for _ in ids[1:])]
+        for i, j, step in _neighbours(count):
+            own[i].append(tie(ids[j], step))
+        return [cs.Agent(i, tied) for i, tied in zip(ids, own, strict=True)], [(ids[j], ids[i]) for i, j, _ in _neighbours(count)]
+
+    return build
 
 
 def _tree(prefix: str, count: int, random: np.random.Generator) -> Instance:
@@ -202,7 +207,8 @@ def _swarm(separate: bool) -> Builder:
 FAMILIES: tuple[Family, ...] = (
     *(Family(f"case {x}", _case(x), (3,), convex=x != "E", feasible=x != "D", paper=True) for x in "ABCDE"),
     Family("chain", _chain, (3, 10, 30, 100, 300, 1000)),
-    Family("grid", _grid, (4, 10, 30, 100, 300, 1000)),
+    Family("grid", _meshed(lambda other, _: cs.near(other, 1)), (4, 10, 30, 100, 300, 1000)),
+    Family("formation", _meshed(lambda other, step: cs.displacement(other, step, 0.5)), (4, 10, 30, 100)),
     Family("tree", _tree, (10, 20, 30)),
     Family("tight chain", _anchored(0.05), (10, 30)),
     Family("infeasible chain", _anchored(-0.1), (10, 30), feasible=False),

@@ -37,7 +37,7 @@ from consat.objective import Nu, Objective, Schedule
 from consat.protocols import ROUNDS, Rounds
 from consat.quadratics import values_and_gradients
 from consat.reference import cluster_margins, max_min
-from consat.scale import automatic, scale
+from consat.scale import Scale, automatic, scale
 from consat.simulate.rounds import HOLD, Weather, _begin, _rounds, _World, _world
 
 CLOSE = 1e-3
@@ -97,8 +97,7 @@ class Stage:
         problem: what.
         copies: local estimates.
         nu: the smoothing.
-        unit: the scale of ψ.
-        length: the team's unit of length.
+        size: the team's natural size.
         cluster: (N,) the instance of each agent.
         best: (S,) the best margins; None for teams that are not convex.
         smooth_best: (S,) the best β.
@@ -111,8 +110,7 @@ class Stage:
     problem: Problem
     copies: Estimates
     nu: Nu
-    unit: float
-    length: float
+    size: Scale
     cluster: np.ndarray
     best: np.ndarray | None
     smooth_best: np.ndarray
@@ -131,12 +129,12 @@ class Stage:
             optimum = max_min(team)
             best = np.asarray(cluster_margins(team, values_and_gradients(team, optimum.positions)[0], copies.cluster))
             center, smooth = _best_smooth(problem, copies.cluster, nu, optimum.positions)
-        return cls(problem, copies, nu, size.psi, size.length, copies.cluster, best, smooth, center)
+        return cls(problem, copies, nu, size, copies.cluster, best, smooth, center)
 
     def world(self, *, rough: bool) -> _World:
         weather = Weather(loss=0.5 if rough else 0.0)
         return _world(
-            self.problem.team, self.copies, self.nu, self.length, convex=self.problem.convex, weather=weather, body=None, record=False
+            self.problem.team, self.copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None, record=False
         )
 
     def copies_sent(self) -> np.ndarray:
@@ -229,7 +227,7 @@ def measure(stage: Stage, name: str, conditions: Sequence[Condition], cap: int, 
         done += CHUNK
         satisfied = _for_good(margins > 0)
         value, target = (margins, stage.best) if name == "max-min" else (smooth, stage.smooth_best)
-        near = np.zeros_like(value, dtype=bool) if target is None else value >= target - CLOSE * stage.unit
+        near = np.zeros_like(value, dtype=bool) if target is None else value >= target - CLOSE * stage.size.psi
         optimal = _for_good(near)
         wanted = problem.convex and (problem.count <= SMALL or name == "max-min")
         if _over(satisfied if problem.feasible else np.zeros(1), optimal[:1] if wanted else np.zeros(1), done):
@@ -269,7 +267,7 @@ def measure_peers(stage: Stage, boxes: Sequence[float], cap: int, steps: np.ndar
             margins, smooth = np.concatenate([margins, full[0]], axis=1), np.concatenate([smooth, full[1]], axis=1)
             done += chunk
             satisfied = _for_good(margins > 0)
-            optimal = _for_good(smooth >= stage.smooth_best - CLOSE * stage.unit)
+            optimal = _for_good(smooth >= stage.smooth_best - CLOSE * stage.size.psi)
             ok = np.isfinite(full[0][alive, -1]).any(axis=-1)
             keep = np.flatnonzero(ok)
             if done == chunk or len(keep) < len(alive) / 2:  # lanes that overflowed everywhere are out; each new shape is compiled anew
@@ -361,7 +359,7 @@ def _twins(stages: Sequence[Stage]) -> str:
         if exact is None or stage.best is None:
             rows.append([stage.problem.name, *cells, success, "", "", ""])
             continue
-        off = np.max(np.abs(stage.best - exact.margin)) / stage.unit
+        off = np.max(np.abs(stage.best - exact.margin)) / stage.size.psi
         rows.append([
             stage.problem.name, *cells, success,
             _median(exact.optimal), f"{np.mean(np.isfinite(exact.optimal)):.0%}", f"{off:.1e}",
@@ -453,7 +451,7 @@ def _targets(stages: Sequence[Stage], compared: Sequence[Stage]) -> str:
         rate = np.mean(np.isfinite(runs))
         rows.append((f"nonconvex ≥ 95 %: {stage.problem.name}", f"{rate:.1%} of {len(runs)} runs ({each})", bool(rate >= 0.95)))
     exact = [(s, s.results["max-min", Condition(4.0, 0.0)]) for s in stages if ("max-min", Condition(4.0, 0.0)) in s.results]
-    off = {s.problem.name: float(np.max(np.abs(s.best - m.margin)) / s.unit) for s, m in exact if s.best is not None}
+    off = {s.problem.name: float(np.max(np.abs(s.best - m.margin)) / s.size.psi) for s, m in exact if s.best is not None}
     if off:
         worst = max(off, key=lambda name: off[name])
         missed = ", ".join(f"{name} {value:.1e}" for name, value in off.items() if not value <= CLOSE)

@@ -156,7 +156,7 @@ def _flow(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
 
 def _rounds(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
     return simulate_rounds(
-        on.team, _with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size.length, on.first,
+        on.team, _with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first,
         convex=bool(shape_of(on.team).concave.all()),
         hopeless=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible",
         enough=(lambda position: _gap(on.team, position) <= SHARP * on.size.psi) if asked.kind == "max-min" else None, **options,

@@ -41,6 +41,11 @@ class Scale(NamedTuple):
     center: np.ndarray
     spread: float
 
+    @property
+    def reach(self) -> float:
+        """How far around the centre, on each axis, the team's places are thought to be."""
+        return MARGIN * self.length + self.spread
+
 
 @float64
 def scale(team: Team) -> Scale:
@@ -67,8 +72,7 @@ def automatic(size: Scale) -> Smoothing:
 
 def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
     """(d,) low and (d,) high of where starts are drawn when nobody says."""
-    half = MARGIN * size.length + size.spread
-    return size.center - half, size.center + half
+    return size.center - size.reach, size.center + size.reach
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

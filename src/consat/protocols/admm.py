@@ -71,6 +71,7 @@ class Admm:
         return 0
 
     def start(self, x: Array, solver: Solver) -> AdmmState:
+        x = solver.nearby(x)
         at_links = solver.links.at(x)
         wish = jnp.zeros(len(x)) + jnp.log(self.penalty / solver.length**2)
         level = solver.links.at(wish)

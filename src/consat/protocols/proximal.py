@@ -53,6 +53,7 @@ class Proximal:
         return 0
 
     def start(self, x: Array, solver: Solver) -> ProximalState:
+        x = solver.nearby(x)
         return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
 
     def speak(self, state: ProximalState, solver: Solver, round_: Array, known: Array) -> tuple[ProximalState, Array]:

@@ -18,6 +18,7 @@ from consat.graphs import hops
 from consat.numerics import CompileClock, Groups, float64, quick_compilation
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
+from consat.scale import Scale
 from consat.simulate import Stop
 from consat.team import Team
 from consat.trace import Ending, Trace, satisfied_from
@@ -84,6 +85,8 @@ class Everyone:
     Attributes:
         links: all ends.
         length: the team's unit of length.
+        center: (d,) the team's middle.
+        reach: how far around it the team's places are.
         batches: the agents by shape.
         nu: the smoothing.
         local: every agent's objective over its copies.
@@ -95,6 +98,8 @@ class Everyone:
 
     links: Ends
     length: Array
+    center: Array
+    reach: Array
     batches: tuple[prox.Bucket, ...]
     nu: Nu
     local: Objective
@@ -111,6 +116,11 @@ class Everyone:
     ) -> tuple[Array, prox.Memory, Array]:
         nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
         return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
+
+    def nearby(self, x: Array) -> Array:
+        away = (x - self.center) / self.reach
+        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
+        return self.center + self.reach * away * ((2.0 - 1.0 / far) / far)
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
@@ -270,7 +280,7 @@ def simulate_rounds(
     protocol: Rounds,
     copies: Estimates,
     nu: Nu,
-    length: float,
+    size: Scale,
     first: np.ndarray,
     *,
     convex: bool,
@@ -290,7 +300,7 @@ def simulate_rounds(
         protocol: what they do.
         copies: the layout of estimates.
         nu: the smoothing.
-        length: the team's unit of length.
+        size: the team's natural size.
         first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
         convex: whether every ψ is known to be concave.
         rounds: how many; `PATIENCE` if None.
@@ -304,7 +314,7 @@ def simulate_rounds(
     """
     weather = weather or Weather()
     end = PATIENCE if rounds is None else rounds
-    world = _world(team, copies, nu, length, convex=convex, weather=weather, body=body, record=record)
+    world = _world(team, copies, nu, size, convex=convex, weather=weather, body=body, record=record)
     seen: list[Seen] = []
     ending: Ending = "out of time"
     done = 0
@@ -320,7 +330,7 @@ def simulate_rounds(
                 done += count
                 progress(done / end, float(seen[-1].margin[-1]))
                 settle = done >= protocol.earliest(world.everyone)
-                if (found := _ending(seen, stop, length, settle, hopeless, enough)) is not None:
+                if (found := _ending(seen, stop, size.length, settle, hopeless, enough)) is not None:
                     ending = found
                     break
         except KeyboardInterrupt:
@@ -332,12 +342,14 @@ def simulate_rounds(
 
 
 def _world(
-    team: Team, copies: Estimates, nu: Nu, length: float, *, convex: bool, weather: Weather, body: Body | None, record: bool | None
+    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, record: bool | None
 ) -> _World:
     ends = Ends.of(copies)
     everyone = Everyone(
         links=ends,
-        length=jnp.asarray(length),
+        length=jnp.asarray(size.length),
+        center=jnp.asarray(size.center),
+        reach=jnp.asarray(size.reach),
         batches=prox.buckets(team, copies.rows, copies.count, convex),
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
