@@ -9,7 +9,8 @@ It converges under random loss and wake-ups from any u: there is no invariant to
 its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest; then each end lets ρ_i rise
 slowly towards the stiffness of its own f_i, and fall towards it only once it knows that all are satisfied: by then the optimum is all that
 is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
-changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays.
+changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i the
+step would have no minimum.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Admm:
         goal = jnp.where(jnp.isnan(stiffness), neighbours, jnp.log(self.share * stiffness + jnp.finfo(x.dtype).tiny))
         since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
         rise = self.rise / (1.0 + (round_ / horizon) ** 4)
-        fall = jnp.where(since > 0, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
+        fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
         wish = wish + jnp.clip(goal - wish, -fall, rise)
         return AdmmState(x, u, wish, state.heard, penalty, memory), (2 * links.at(x) - u, links.at(wish))
 

@@ -110,6 +110,11 @@ class Solver(Protocol):
         """Links that a message crosses, at most, from one agent of a cluster to another; common knowledge."""
         ...
 
+    @property
+    def convex(self) -> bool:
+        """Whether every constraint of the team is known to be concave; common knowledge."""
+        ...
+
     def nearby(self, x: Array) -> Array:
         """(rows, d) positions, brought to where the team's places are, which is common knowledge: unchanged inside, and from far away, keeping
         their directions, to at most twice as far out."""

@@ -94,6 +94,7 @@ class Everyone:
         talkers: groups the ends by agent.
         agents: N.
         hops: see `consat.graphs.hops`.
+        convex: whether every ψ is known to be concave.
     """
 
     links: Ends
@@ -107,6 +108,7 @@ class Everyone:
     talkers: Groups
     agents: int = field(metadata={"static": True})
     hops: int = field(metadata={"static": True})
+    convex: bool = field(metadata={"static": True})
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
         return prox.recall(self.batches, self.agents, self.nu, x, kappa)
@@ -357,6 +359,7 @@ def _world(
         talkers=Groups.of(copies.holder[copies.edges[:, 0]], team.count),
         agents=team.count,
         hops=hops(team.count, copies.links),
+        convex=convex,
     )
     talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
     pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)
