@@ -51,7 +51,8 @@ class Admm:
     """See the module.
 
     Attributes:
-        relaxation: a in (0, 1); above 1/2 is over-relaxed.
+        relaxation: a in (0, 1); above 1/2 is over-relaxed, …
+        cautious: … which only convex teams are: where some ψ are not concave a is at most this. With more they fell into cycles.
         penalty: ρ at the start, in 1/length².
         share: of the stiffness, that ρ_i moves towards.
         rise: how much ln ρ_i may rise in a round.
@@ -60,6 +61,7 @@ class Admm:
     """
 
     relaxation: float = 0.7
+    cautious: float = 0.5
     penalty: float = 10.0
     share: float = 0.3
     rise: float = 0.02
@@ -99,5 +101,6 @@ class Admm:
 
     def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:
         q, wish = message
-        u = jnp.where(arrived[:, None], (1 - self.relaxation) * state.u + self.relaxation * q, state.u)
+        a = self.relaxation if solver.convex else min(self.relaxation, self.cautious)
+        u = jnp.where(arrived[:, None], (1 - a) * state.u + a * q, state.u)
         return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))
