@@ -92,7 +92,8 @@ class Admm:
         v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
         x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory, sharper, above)
         neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
-        goal = jnp.where(jnp.isnan(stiffness), neighbours, jnp.log(self.share * stiffness + jnp.finfo(x.dtype).tiny))
+        stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
+        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.log(stiff + jnp.finfo(x.dtype).tiny))
         since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
         rise = self.rise / (1.0 + (round_ / horizon) ** 4)
         fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
