@@ -9,8 +9,8 @@ It converges under random loss and wake-ups from any u: there is no invariant to
 its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest; then each end lets ρ_i rise
 slowly towards the stiffness of its own f_i, and fall towards it only once it knows that all are satisfied: by then the optimum is all that
 is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
-changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i the
-step would have no minimum.
+changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the
+negative curvature of f_i the step would have no minimum.
 """
 
 from __future__ import annotations

@@ -30,7 +30,9 @@ PATIENCE = 2000
 CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
 SETTLED = 1e-5
-"""A team has settled when over `HOLD` rounds no position moved by more than this fraction of the team's unit of length."""
+"""A team has settled when over `HOLD` rounds no position moved by more than this fraction of the team's unit of length, …"""
+SETTLED_ALL_THE_SAME = 1e-7
+"""… or than this, where a certificate should say when it is `enough`."""
 TOLERANCE = 1e-9
 """Of every local step, relative."""
 MOST_NUMBERS = 1000
@@ -120,9 +122,10 @@ class Everyone:
         return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
 
     def nearby(self, x: Array) -> Array:
-        away = (x - self.center) / self.reach
+        away = (x - self.center[None, :]) / self.reach
         far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
-        return self.center + self.reach * away * ((2.0 - 1.0 / far) / far)
+        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
+        return jnp.where(idle[:, None], x, self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far))
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
@@ -406,7 +409,8 @@ def _ending(
     if stop == "converged" and enough is not None and enough(last.position[-1]):
         return "settled"
     position = np.concatenate([part.position for part in seen[-3:]])[-HOLD:]
-    settled = settle and len(position) == HOLD and np.abs(position - position[-1]).max(initial=0.0) <= SETTLED * length
+    still = SETTLED if enough is None else SETTLED_ALL_THE_SAME
+    settled = settle and len(position) == HOLD and np.abs(position - position[-1]).max(initial=0.0) <= still * length
     return "settled" if settled and (stop == "converged" or hopeless(position[-1])) else None
 
 
