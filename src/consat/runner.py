@@ -25,7 +25,8 @@ from consat.scenario import Scenario, dump, load
 from consat.settings import ProtocolSettings, Settings, Smoothing, Start
 from consat.simulate import Stop
 from consat.simulate.flows import simulate_flow
-from consat.simulate.rounds import Body, Weather, simulate_rounds
+from consat.simulate.kernel import Body, Weather
+from consat.simulate.rounds import simulate_rounds
 from consat.team import Team
 from consat.trace import Trace
 
