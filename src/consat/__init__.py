@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
+    from consat.groups import Group, each
     from consat.result import Result
     from consat.runner import run, solve
     from consat.scenario import Scenario, dump, load, loads
@@ -23,6 +24,7 @@ _HOME = {
     "errors": (
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
+    "groups": ("Group", "each"),
     "result": ("Result",),
     "runner": ("run", "solve"),
     "scenario": ("Scenario", "dump", "load", "loads"),
@@ -32,9 +34,9 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Agent", "ConsatError", "Constraint", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
+    "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
     "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
-    "expr", "halfspace", "load", "loads", "near", "outside", "run", "solve", "within",
+    "each", "expr", "halfspace", "load", "loads", "near", "outside", "run", "solve", "within",
 ]  # fmt: skip
 
 

@@ -225,8 +225,14 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) ->
                 f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team"
             )
     random = np.random.default_rng(start.seed)
-    drawn = random.uniform(low, high, (team.count, d))
-    first = random.uniform(low, high, (copies.count, d))
+    where = (team.count, d), (copies.count, d)
+    drawn, first = (random.uniform(low, high, shape) for shape in where)
+    if team.around is not None:  # what the box gives, moved into the box that each has of its own
+        place, reach = team.around
+        half = np.where(high > low, (high - low) / 2, 1.0)
+        for values, whose in ((drawn, slice(None)), (first, copies.position)):
+            near = place[whose] + reach[whose][:, None] * (values - (low + high) / 2) / half
+            values[...] = np.where(np.isnan(near), values, near)
     first[copies.own] = np.where(np.isnan(team.starts), drawn, team.starts)
     return first
 
