@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
     from consat.groups import Group, each
     from consat.result import Result
-    from consat.runner import run, solve
+    from consat.runner import resume, run, solve
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
     from consat.team import Agent, Team
@@ -26,7 +26,7 @@ _HOME = {
     ),
     "groups": ("Group", "each"),
     "result": ("Result",),
-    "runner": ("run", "solve"),
+    "runner": ("resume", "run", "solve"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "team": ("Agent", "Team"),
@@ -34,9 +34,9 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
-    "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
-    "each", "expr", "halfspace", "load", "loads", "near", "outside", "run", "solve", "within",
+    "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
+    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
+    "each", "expr", "halfspace", "load", "loads", "near", "outside", "resume", "run", "solve", "within",
 ]  # fmt: skip
 
 
