@@ -29,7 +29,8 @@ from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Schedule
 from consat.protocols import GradientFlow
-from consat.simulate.flows import CHUNK, Problem, _advance
+from consat.simulate.flows import CHUNK, Observer, Problem, _advance
+from consat.simulate.recording import Choice
 from tests import paper
 
 UNTIL = 300.0
@@ -86,26 +87,25 @@ def batch(starts: int) -> None:
     team, settings = cs.load("case-c").team, cs.load("case-c").settings
     copies, flow = Estimates.of(team, "full"), GradientFlow()
     problem = Problem.of(team, copies, Schedule.of(settings.smoothing))
+    observer = Observer.of(team, copies, Choice.of(team, copies))
     first = jnp.asarray(np.random.default_rng(0).uniform(-4, 4, (starts, copies.count, 2)))
     times = [jnp.asarray(part) for part in np.linspace(0, UNTIL, 3001)[np.arange(0, 3000, CHUNK)[:, None] + np.arange(CHUNK + 1)]]
-    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advance().__wrapped__(flow, problem, state, times))(states))
+    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advance().__wrapped__(flow, problem, observer, state, times))(states))
 
     def singles() -> None:
         for x in first:
             state = flow.start(x)
             for part in times:
-                states, _ = _advance()(flow, problem, state, part)
-                state = jax.tree.map(lambda leaf: leaf[-1], states)
+                _, state, *_ = _advance()(flow, problem, observer, state, part)
         jax.block_until_ready(state)
 
     def as_one() -> None:
         state = jax.vmap(flow.start)(first)
         for part in times:
-            states, _ = together(state, part)
-            state = jax.tree.map(lambda leaf: leaf[:, -1], states)
+            _, state, *_ = together(state, part)
         jax.block_until_ready(state)
 
-    jax.block_until_ready(_advance()(flow, problem, flow.start(first[0]), times[0]))
+    jax.block_until_ready(_advance()(flow, problem, observer, flow.start(first[0]), times[0]))
     jax.block_until_ready(together(jax.vmap(flow.start)(first), times[0]))
     one, many = median(1, as_one), median(1, singles)
     print(f"one batch (adaptive, implicit, vmap): {one:.1f} s; {starts} warm runs: {many:.1f} s; runs/batch {many / one:.2f}")

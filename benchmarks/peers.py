@@ -18,7 +18,7 @@ from jax import Array
 
 from consat.numerics import quick_compilation
 from consat.objective import Nu
-from consat.simulate.rounds import Everyone
+from consat.simulate.kernel import Everyone
 
 RAMP = (0.002, 0.0044)
 """Start, and rise in a second, of the paper's ramp of ν_β, as fractions of its end (0.01 and 0.022 of 5)."""

@@ -38,7 +38,8 @@ from consat.protocols import ROUNDS, Rounds
 from consat.quadratics import values_and_gradients
 from consat.reference import cluster_margins, max_min
 from consat.scale import Scale, automatic, scale
-from consat.simulate.rounds import HOLD, Weather, _begin, _rounds, _World, _world
+from consat.simulate.kernel import Weather, World, begin, many_rounds, world_of
+from consat.simulate.rounds import HOLD
 
 CLOSE = 1e-3
 """Of the scale of ψ: how near the optimum counts as there."""
@@ -131,11 +132,9 @@ class Stage:
             center, smooth = _best_smooth(problem, copies.cluster, nu, optimum.positions)
         return cls(problem, copies, nu, size, copies.cluster, best, smooth, center)
 
-    def world(self, *, rough: bool) -> _World:
+    def world(self, *, rough: bool) -> World:
         weather = Weather(loss=0.5 if rough else 0.0)
-        return _world(
-            self.problem.team, self.copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None, record=False
-        )
+        return world_of(self.problem.team, self.copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None)
 
     def copies_sent(self) -> np.ndarray:
         """(S,) positions sent in a round, in each instance."""
@@ -177,15 +176,16 @@ def _look(observer: Objective, groups: Groups, nu: Nu, x: Array) -> tuple[Array,
 
 
 @functools.partial(jax.jit, static_argnames=("protocol",), compiler_options=quick_compilation())
-def _start(protocol: Rounds, world: _World, first: Array, keys: Array) -> Any:
-    return jax.vmap(lambda x, key: _begin(protocol, world, x, key)[0])(first, keys)
+def _start(protocol: Rounds, world: World, first: Array, keys: Array) -> Any:
+    return jax.vmap(lambda x, key: begin(protocol, world, x, key)[0])(first, keys)
 
 
 @functools.partial(jax.jit, static_argnames=("protocol",), compiler_options=quick_compilation())
-def _go_on(protocol: Rounds, world: _World, groups: Groups, now: Any, numbers: Array, loss: Array) -> Any:
+def _go_on(protocol: Rounds, world: World, groups: Groups, now: Any, numbers: Array, loss: Array) -> Any:
     def one(now: Any, loss: Array) -> Any:
-        now, seen = _rounds(protocol, dataclasses.replace(world, loss=loss), now, numbers)
-        return now, jax.lax.map(lambda x: _look(world.observer, groups, world.everyone.nu, x), seen.position, batch_size=CHUNK)
+        world_ = dataclasses.replace(world, loss=loss)
+        now, position = many_rounds(protocol, world_, now, numbers, lambda seen: seen.position)
+        return now, jax.lax.map(lambda x: _look(world.observer, groups, world.everyone.nu, x), position, batch_size=CHUNK)
 
     return jax.vmap(one)(now, loss)
 

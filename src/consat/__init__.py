@@ -12,8 +12,9 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
+    from consat.groups import Group, each
     from consat.result import Result
-    from consat.runner import run, solve
+    from consat.runner import resume, run, solve
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
     from consat.team import Agent, Team
@@ -23,8 +24,9 @@ _HOME = {
     "errors": (
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
+    "groups": ("Group", "each"),
     "result": ("Result",),
-    "runner": ("run", "solve"),
+    "runner": ("resume", "run", "solve"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "team": ("Agent", "Team"),
@@ -32,9 +34,9 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Agent", "ConsatError", "Constraint", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings",
-    "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint", "displacement", "dump",
-    "expr", "halfspace", "load", "loads", "near", "outside", "run", "solve", "within",
+    "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
+    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint",
+    "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "near", "outside", "resume", "run", "solve", "within",
 ]  # fmt: skip
 
 

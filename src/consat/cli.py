@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import click
 
@@ -19,6 +19,8 @@ from consat.errors import ConsatError, InvalidInput, InvalidSettings
 if TYPE_CHECKING:
     from consat.scenario import Scenario
 
+PATIENCE = 2000
+"""Rounds, or seconds of a flow, that a run may take when nobody says."""
 DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
 scenario_argument = click.argument("scenario", metavar="FILE")
@@ -81,8 +83,12 @@ def init(name: str | None) -> None:
     click.echo(f"{target} written; now: consat run {target}", err=True)
 
 
+def _names(context: click.Context, parameter: click.Parameter, value: str | None) -> Any:
+    return value if value in (None, "all", "none") else [name.strip() for name in str(value).split(",")]
+
+
 @cli.command()
-@scenario_argument
+@click.argument("scenario", metavar="FILE", required=False)
 @set_option
 @click.option("--protocol", metavar="KIND", help="admm (default), proximal, max-min, gradient-flow, proportional-integral, selfish.")
 @click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
@@ -96,24 +102,41 @@ def init(name: str | None) -> None:
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there.")
+@click.option("--every", type=click.IntRange(min=1), default=1, metavar="K", help="Record each K-th round, or sample of a flow.")
+@click.option(
+    "--record",
+    "agents",
+    metavar="IDS",
+    callback=_names,
+    help="Of whom to record: a1,a2, all or none; of large teams a sample, if not given.",
+)
+@click.option("--checkpoint", is_flag=False, flag_value="10", type=click.FloatRange(min=0), metavar="SECONDS",
+              help="Keep the state in --out, each so many seconds (10 if not said), to go on from with --resume.")  # fmt: skip
+@click.option(
+    "--resume", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Go on with a run that kept checkpoints there."
+)
 @click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @json_option
 def run(
-    scenario: str, overrides: tuple[str, ...], out: Path | None, full: bool, quiet: bool, as_json: bool, **settings: Any
+    scenario: str | None, overrides: tuple[str, ...], resume: Path | None, full: bool, quiet: bool, as_json: bool, **settings: Any
 ) -> int:  # fmt: skip
     """Run the distributed protocol."""
     _cache_compilations()
-    loaded = _load(scenario, overrides)
-    from consat.runner import run as run_team
+    out = settings["out"] = resume or settings["out"]
+    _fit_together(scenario, resume, out, settings["checkpoint"])
+    loaded = None if scenario is None else _load(scenario, overrides)
+    from consat import runner
 
-    with _progress(quiet or as_json) as progress, _located(loaded):
-        result = run_team(loaded, full=full, progress=progress, **settings)
+    with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, _located(loaded):
+        if loaded is None:
+            kept = {key: settings[key] for key in ("rounds", "until", "checkpoint")}
+            result = runner.resume(cast(Path, resume), full=full, progress=progress, **kept)
+        else:
+            result = runner.run(loaded, full=full, progress=progress, **settings)
     if settings["auxiliary"] is not None:
         _say_auxiliary(settings["auxiliary"], result.binding("auxiliary"))
     if out is not None:
-        result.summary["result"] = str(out / "result.nc")
-        result.save(out / "result.nc")
         figures = result.plot(out)
         if not (quiet or as_json):
             _say(f"written: {', '.join(str(path) for path in (out / 'result.nc', *figures))}")
@@ -124,6 +147,13 @@ def run(
     if result.summary["ending"] == "interrupted":
         return INTERRUPTED
     return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+
+
+def _fit_together(scenario: str | None, resume: Path | None, out: Path | None, checkpoint: float | None) -> None:
+    if (scenario is None) == (resume is None):
+        raise click.UsageError("give a scenario, FILE, to run, or --resume DIR to go on with a run; not both, not neither")
+    if checkpoint is not None and out is None:
+        raise click.UsageError("--checkpoint needs --out DIR, where the checkpoint will stand beside the result")
 
 
 @cli.command()
@@ -202,14 +232,14 @@ def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:
 
 
 @contextmanager
-def _located(scenario: Scenario) -> Iterator[None]:
+def _located(scenario: Scenario | None) -> Iterator[None]:
     """Faults that show only later, such as a cluster without links, get their place in the file."""
     from consat.scenario import located
 
     try:
         yield
     except InvalidInput as error:
-        raise located(error, scenario) from None
+        raise error if scenario is None else located(error, scenario) from None
 
 
 def _cache_compilations() -> None:
@@ -223,20 +253,27 @@ def _cache_compilations() -> None:
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[float, float | None], None]]:
-    """A bar on stderr, where that is a terminal."""
+def _progress(quiet: bool, total: float | None = None) -> Iterator[Callable[[float, float | None], None]]:
+    """A bar on stderr, where that is a terminal; with its rate, if it is known of how many rounds, or seconds of a flow, it tells."""
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
         return
+    import time
+
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[margin]}")
+    columns = BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[said]}")
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("run", total=1.0, margin="compiling …")
+        task = bar.add_task("run", total=1.0, said="compiling …")
+        first: list[tuple[float, float]] = []
 
         def update(done: float, margin: float | None) -> None:
-            bar.update(task, completed=done, margin="" if margin is None else f"margin {margin:+.4g}")
+            first.append((time.perf_counter(), done)) if not first else None
+            since, before = first[0]
+            per_second = (done - before) * (total or PATIENCE) / max(time.perf_counter() - since, 1e-9)
+            rate = f"{per_second:,.0f}/s   " if margin is not None and done > before else ""
+            bar.update(task, completed=done, said="" if margin is None else f"{rate}margin {margin:+.4g}")
 
         yield update
 

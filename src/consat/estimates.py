@@ -97,9 +97,8 @@ class Estimates:
         """The edges as arrays for the device."""
         agents = len(self.own)
         if self.count == agents**2 and self.count:  # everyone holds everything: one Laplacian for all positions
-            both = np.concatenate([self.links, self.links[:, ::-1]])
-            both = both[np.lexsort((both[:, 1], both[:, 0]))]
-            return Exchange(jnp.asarray(both[:, 1]), Groups.of(both[:, 0], agents), agents)
+            here, there = _both_ways(self.links, agents)
+            return Exchange(jnp.asarray(there), Groups.of(here, agents), agents)
         return Exchange(jnp.asarray(self.edges[:, 1]), Groups.of(self.edges[:, 0], self.count), 1)
 
 
@@ -113,11 +112,21 @@ def _everyone(cluster: np.ndarray) -> np.ndarray:
 def _shared(pairs: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
     """Edges between rows: for each link and direction, the positions that both ends hold."""
     keys = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
-    both = np.concatenate([links, links[:, ::-1]])
-    offsets = np.searchsorted(pairs[:, 0], np.arange(count + 1))
-    sizes = (offsets[1:] - offsets[:-1])[both[:, 0]]
-    receiver = np.repeat(offsets[both[:, 0]], sizes) + np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    wanted = np.repeat(both[:, 1], sizes).astype(np.int64) * count + pairs[receiver, 1]
+    here, there = _both_ways(links, count)
+    offsets = np.searchsorted(pairs[:, 0], np.arange(count + 1, dtype=pairs.dtype))
+    sizes = (offsets[1:] - offsets[:-1])[here]
+    starts = np.cumsum(sizes) - sizes
+    receiver = np.repeat(offsets[here] - starts, sizes) + np.arange(sizes.sum())
+    wanted = np.repeat(there.astype(np.int64) * count, sizes) + pairs[receiver, 1]
     sender = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    edges = np.stack([receiver, sender], axis=1)[keys[sender] == wanted]
-    return edges[np.lexsort((edges[:, 1], edges[:, 0]))].astype(np.int32)
+    both = keys[sender] == wanted
+    edges = np.sort(receiver[both] * len(keys) + sender[both])
+    return np.stack(np.divmod(edges, max(len(keys), 1)), axis=1).astype(np.int32)
+
+
+def _both_ways(links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every link in both directions, (2L,) and (2L,), sorted by the first."""
+    low, high = links.astype(np.int64).T
+    keys = np.sort(np.concatenate([low * count + high, high * count + low]))
+    here, there = np.divmod(keys, max(count, 1))
+    return here.astype(np.int32), there.astype(np.int32)

@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from consat.errors import Fault, InvalidTeam
+from consat.family import distinct
 from consat.team import Team
 
 if TYPE_CHECKING:
@@ -26,12 +27,17 @@ def task_edges(team: Team) -> np.ndarray:
     Returns:
         (E, 2) int32, sorted, each edge once.
     """
+    return _unique_pairs(_reads(team), team.count)
+
+
+def _reads(team: Team) -> np.ndarray:
+    """The edges of the task graph, in any order and as often as there are constraints for them; (E', 2) int32."""
     edges = [np.zeros((0, 2), dtype=np.int32)]
     for family in team.families:
         for slot in range(family.arity):
             pairs = np.stack([family.owner, family.agents[:, slot]], axis=1)
             edges.append(pairs if family.arity == 1 else pairs[pairs[:, 0] != pairs[:, 1]])
-    return _unique_pairs(np.concatenate(edges), team.count)
+    return np.concatenate(edges)
 
 
 def clusters(team: Team) -> np.ndarray:
@@ -40,7 +46,7 @@ def clusters(team: Team) -> np.ndarray:
     Returns:
         (N,) int32 labels from 0, in the order of their first agents.
     """
-    return _components(task_edges(team), team.count)
+    return _components(_reads(team), team.count)
 
 
 def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
@@ -83,18 +89,33 @@ def hops(count: int, links: np.ndarray) -> int:
         count: N.
         links: (L, 2).
     """
-    graph = coo_array((np.ones(len(links), dtype=np.int8), (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
-    longest, labels = 0, _components(links, count)
-    for start in np.unique(labels, return_index=True)[1]:
-        far = start
-        for _ in range(2):
-            order, parent = breadth_first_order(graph, far, directed=False)
-            depth = np.zeros(count, dtype=np.int64)
-            for agent in order[1:]:
-                depth[agent] = depth[parent[agent]] + 1
-            far = order[np.argmax(depth[order])]
-            longest = max(longest, int(depth[far]))
+    labels = _components(links, count)
+    starts = np.unique(labels, return_index=True)[1]
+    longest = 0
+    for _ in range(2):
+        depth, order = _depths(links, count, starts)
+        longest = max(longest, int(depth.max(initial=0)))
+        starts = np.zeros(len(starts), dtype=np.intp)
+        starts[labels[order]] = order  # the last one stays: the deepest of its component
     return longest
+
+
+def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many links each agent, in the order of a breadth-first search, is from the start in its component; and that order."""
+    root = np.stack([np.full(len(starts), count), starts], axis=1)  # one search from all starts, as if they hung on one more agent
+    edges = np.concatenate([links, root])
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count + 1, count + 1)).tocsr()
+    order, parent = breadth_first_order(graph, count, directed=False)
+    place = np.empty(count + 1, dtype=np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    above = place[np.maximum(parent[order], 0)]
+    above[0] = 0
+    depth = np.ones(len(order), dtype=np.int32)
+    depth[0] = 0
+    while above.any():  # twice as far up each time, so that a chain of a million takes twenty turns
+        depth += depth[above]
+        above = above[above]
+    return depth[1:] - 1, order[1:]
 
 
 def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
@@ -109,7 +130,7 @@ def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
         (C, 2) int32 pairs (holder, position), sorted, each once.
     """
     own = np.arange(team.count, dtype=np.int32)
-    pairs = _unique_pairs(np.concatenate([task_edges(team), np.stack([own, own], axis=1)]), team.count)
+    pairs = _unique_pairs(np.concatenate([_reads(team), np.stack([own, own], axis=1)]), team.count)
     relays = list(_relays(pairs, cluster_links(team, cluster), team.count))
     return _unique_pairs(np.concatenate([pairs, *relays]), team.count) if relays else pairs
 
@@ -117,7 +138,9 @@ def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
 def _relays(pairs: np.ndarray, links: np.ndarray, count: int) -> Iterator[np.ndarray]:
     """Extra (holder, position) pairs. Positions whose readers are all linked to their owner need none, and cost no loop."""
     foreign = pairs[pairs[:, 0] != pairs[:, 1]]
-    linked = np.isin(_keys(np.sort(foreign, axis=1), count), _keys(links, count))
+    known = _keys(links, count)  # sorted, as links are
+    wanted = _keys(np.stack([foreign.min(axis=1), foreign.max(axis=1)], axis=1), count)
+    linked = np.append(known, -1)[np.searchsorted(known, wanted)] == wanted
     remote = np.unique(foreign[~linked, 1])
     if not len(remote):
         return
@@ -178,7 +201,7 @@ def _keys(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    keys = np.unique(_keys(pairs, count))
+    keys = distinct(_keys(pairs, count))
     return np.stack([keys // count, keys % count], axis=1).astype(np.int32)
 
 

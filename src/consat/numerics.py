@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import ParamSpec, Self, TypeVar
 
@@ -29,6 +29,20 @@ def float64(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **kwargs)
 
     return wrapped
+
+
+def once(rows: np.ndarray) -> np.ndarray:
+    """(M, …) → (1, …) where all rows are known to be one row in memory, so that what is computed of a million equal rows is computed once;
+    else as it is."""
+    return rows[:1] if len(rows) > 1 and rows.strides[0] == 0 else rows
+
+
+def stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrays one after the other; where all rows are equal and each part holds one row in memory, so does the whole."""
+    rows = [once(part) for part in parts]
+    if all(len(row) == 1 for row in rows) and all(np.array_equal(rows[0], row) for row in rows[1:]):
+        return np.broadcast_to(rows[0], (sum(map(len, parts)), *rows[0].shape[1:]))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def quick_compilation() -> dict[str, bool | int] | None:

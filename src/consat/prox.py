@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.family import Family
 from consat.objective import Nu
-from consat.team import Family, Team
+from consat.team import Team
 
 MOST_ITERATIONS = 200
 SMALL_TEAM = 2000

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from consat.constraints.curvature import Curvature, hessians, read_curvatures
-from consat.numerics import float64
-from consat.team import Family, Team
+from consat.family import Family
+from consat.numerics import float64, once
+from consat.team import Team
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -37,18 +38,15 @@ class Shape:
         curvature: (M,) of `Curvature`, in all positions jointly.
         strict_in_own: (M,) whether strictly concave in the owner's position, the others held.
         quadratic: (M,) whether a polynomial of degree ≤ 2.
+        concave: (M,) whether proven concave in all positions jointly.
         hessians: for each family (M_f, n, n) constant weighted Hessians, n = arity·d, or None beyond degree 2.
     """
 
     curvature: NDArray[np.object_]
     strict_in_own: Bools
     quadratic: Bools
+    concave: Bools
     hessians: tuple[Floats | None, ...]
-
-    @property
-    def concave(self) -> Bools:
-        """(M,) whether ψ is proven concave in all its positions jointly."""
-        return np.isin(self.curvature.astype(str), (Curvature.CONCAVE, Curvature.STRICTLY_CONCAVE))
 
 
 @functools.lru_cache(maxsize=16)
@@ -56,16 +54,17 @@ def shape_of(team: Team) -> Shape:
     """Read the curvature of every constraint of a team; a team is read once."""
     count = len(team.owner)
     curvature = np.full(count, Curvature.UNKNOWN, dtype=object)
-    strict, quadratic = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    strict, quadratic, concave = np.zeros((3, count), dtype=bool)
     constant: list[Floats | None] = []
     for family in team.families:
         readings = read_curvatures(family.psi, family.arity, team.dimension, family.parameters, family.size)
-        own = np.argmax(family.agents == family.owner[:, None], axis=1)
-        curvature[family.number] = readings.curvature
-        strict[family.number] = readings.strict_in[np.arange(family.size), own]
+        found, strict_in = once(readings.curvature), once(readings.strict_in)
+        curvature[family.number] = found
+        concave[family.number] = (found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)
+        strict[family.number] = np.any(strict_in & (family.agents == family.owner[:, None]), axis=1)
         quadratic[family.number] = readings.degree is not None
         constant.append(None if readings.degree is None else _hessians(family, team.dimension))
-    return Shape(curvature, strict, quadratic, tuple(constant))
+    return Shape(curvature, strict, quadratic, concave, tuple(constant))
 
 
 def _hessians(family: Family, dimension: int) -> Floats:

@@ -5,21 +5,22 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from consat.errors import InvalidResult
+from consat.netcdf import FINAL, SCHEMA, UNITS, VARIABLES, axis_names
 from consat.team import Team
 from consat.trace import Trace
 
 if TYPE_CHECKING:
     import xarray as xr
 
-SCHEMA = "consat.result/1"
-AXES = ("x", "y", "z")
+LARGE = 2**28
+"""Bytes of a file beyond which arrays are read only when they are asked for."""
 SLIGHT = 1e-3
 """A constraint with a smaller multiplier does not bind."""
 
@@ -48,6 +49,8 @@ class Result:
             return self._data
         assert self._trace is not None
         assert self._team is not None
+        if self._trace.file is not None:
+            return _read(self._trace.file)
         return dataset(self._trace, self._team, self.summary, self.scenario)
 
     @functools.cached_property
@@ -67,6 +70,8 @@ class Result:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write NetCDF-4; `Result.load` reads it back without loss."""
         target = Path(path)
+        if self._trace is not None and self._trace.file is not None and target.resolve() == self._trace.file.resolve():
+            return target  # it was written as the run went on
         target.parent.mkdir(parents=True, exist_ok=True)
         self.data.to_netcdf(target, engine="h5netcdf", format="NETCDF4")
         return target
@@ -78,12 +83,10 @@ class Result:
         Raises:
             InvalidResult: no such file, or not a result of consat.
         """
-        import xarray as xr
-
         if not Path(path).is_file():
             raise InvalidResult(f"{path}: there is no such file; `consat run SCENARIO --out DIR` writes DIR/result.nc")
         try:
-            data = xr.load_dataset(path, engine="h5netcdf")
+            data = _read(Path(path))
             schema, summary, scenario = data.attrs["schema"], json.loads(data.attrs["summary"]), data.attrs["scenario"]
         except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise InvalidResult(f"{path}: this is not a result of consat ({error}); give a file that `consat run --out` wrote") from error
@@ -112,29 +115,68 @@ class Result:
         return f"<Result of {self.summary['scenario']}: {self.summary['status']}, margin {self.summary['margin']}>"
 
 
+def _read(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    if path.stat().st_size > LARGE:
+        return xr.open_dataset(path, engine="h5netcdf")
+    return xr.load_dataset(path, engine="h5netcdf")
+
+
+def labels(
+    ids: Sequence[str], agents: np.ndarray | None, cluster: np.ndarray, copies: tuple[np.ndarray, np.ndarray] | None
+) -> dict[str, np.ndarray]:
+    """Who is who in a record: ``agent`` and ``cluster``, (R,), if anybody is recorded; with estimates ``holder`` and ``held``, (E,).
+
+    Args:
+        ids: of the team.
+        agents: (R,) who is recorded; all if None.
+        cluster: (N,) of each agent.
+        copies: (E,) holder and (E,) held, if estimates are recorded.
+    """
+    found: dict[str, np.ndarray] = {}
+    if agents is None or len(agents):
+        names = list(ids) if agents is None else [ids[int(i)] for i in agents]
+        found |= {"agent": np.array(names, dtype=object), "cluster": cluster if agents is None else cluster[agents]}
+    if copies is not None and len(copies[0]):
+        for name, members in zip(("holder", "held"), copies, strict=True):
+            found[name] = np.array([ids[int(i)] for i in members], dtype=object)
+    return found
+
+
+def variables(named: Mapping[str, np.ndarray], *, integral: bool) -> list[str]:
+    """What is recorded, of people with these `labels`."""
+    of_agents = ["position", "velocity", "agent_margin"] if "agent" in named else []
+    of_copies = ["estimate", *(["integral"] if integral else [])] if "holder" in named else []
+    return ["margin", "smooth_margin", *of_agents, *of_copies]
+
+
+def attributes(summary: Mapping[str, Any], scenario: str | None) -> dict[str, Any]:
+    """Of a result file: everything that is known at the end of a run."""
+    told = {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
+    return {"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or "", **told}
+
+
 def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> xr.Dataset:
     """A trace with names: dimensions time or round, agent, axis, and for copies `copy` with its holder and the agent it is of."""
     import xarray as xr
 
     clock = trace.clock
-    ids = np.array(team.ids, dtype=object)
-    axes = [AXES[k] if team.dimension <= len(AXES) else f"x{k + 1}" for k in range(team.dimension)]
-    along = {"time": "s", "round": "1"}[clock]
-    space = (clock, "agent", "axis")
+    copies = None if trace.estimate is None else (trace.holder, trace.held)
+    named = labels(team.ids, trace.recorded, trace.cluster, copies)
+    along = {"agent": "agent", "cluster": "agent", "holder": "copy", "held": "copy"}
     data = xr.Dataset(
         {
-            "position": (space, trace.position, {"units": "length", "long_name": "own position x_i"}),
-            "velocity": (space, trace.velocity, {"units": "length/s", "long_name": "velocity command u_i"}),
-            "margin": (clock, trace.margin, {"long_name": "margin β̄, the smallest ψ of the team"}),
-            "smooth_margin": (clock, trace.smooth_margin, {"long_name": "smooth margin β"}),
-            "agent_margin": ((clock, "agent"), trace.agent_margin, {"long_name": "agent margin ᾱ_i"}),
+            name: ((clock, *VARIABLES[name][0]), getattr(trace, name), VARIABLES[name][1])
+            for name in variables(named, integral=trace.integral is not None)
         },
-        coords={clock: (clock, trace.steps, {"units": along}), "agent": ids, "axis": axes, "cluster": ("agent", trace.cluster)},
-        attrs={"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or ""},
+        coords={
+            clock: (clock, trace.steps, {"units": UNITS[clock]}),
+            "axis": axis_names(team.dimension),
+            **{name: (along[name], values) for name, values in named.items()},
+        },
+        attrs=attributes(summary, scenario),
     )
-    data.attrs |= {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
-    for name, values, words in (("estimate", trace.estimate, "estimate x_j^(i)"), ("integral", trace.integral, "integral state z_i")):
-        if values is not None:
-            data[name] = ((clock, "copy", "axis"), values, {"long_name": words})
-            data = data.assign_coords(holder=("copy", ids[trace.holder]), held=("copy", ids[trace.held]))
+    if trace.recorded is not None:
+        data["final_position"] = (("member", "axis"), trace.end, FINAL)
     return data

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -21,11 +22,15 @@ from consat.protocols import FLOWS, ROUNDS
 from consat.quadratics import shape_of
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
-from consat.scenario import Scenario, dump, load
+from consat.scenario import Scenario, dump, load, loads
 from consat.settings import ProtocolSettings, Settings, Smoothing, Start
 from consat.simulate import Stop
+from consat.simulate import checkpoint as checkpoints
+from consat.simulate.files import RESULT, Files
 from consat.simulate.flows import simulate_flow
-from consat.simulate.rounds import Body, Weather, simulate_rounds
+from consat.simulate.kernel import Body, Weather
+from consat.simulate.recording import Choice, Who
+from consat.simulate.rounds import simulate_rounds
 from consat.team import Team
 from consat.trace import Trace
 
@@ -57,6 +62,10 @@ def run(
     speed: float | None = None,
     auxiliary: float | None = None,
     record: bool | None = None,
+    agents: Who = None,
+    every: int = 1,
+    out: str | os.PathLike[str] | None = None,
+    checkpoint: float | None = None,
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Result:
@@ -78,6 +87,10 @@ def run(
         speed: the most that such a body moves, length/s.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         record: whether to keep all estimates and integral states; by default while they are few.
+        agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
+        every: each how manieth round, or sample of a flow, to record.
+        out: a directory, for a result file ``result.nc`` that grows as the run goes on; by default the record is held in memory.
+        checkpoint: seconds between two checkpoints in `out`, from which `resume` goes on; none if None.
         full: whether to list every agent in the summary, however many.
         progress: called with the fraction done and the margin.
 
@@ -89,27 +102,70 @@ def run(
         InvalidScenario: the scenario has faults.
         InvalidSettings: the settings do not fit together.
     """
-    scenario = _scenario(team)
-    if auxiliary is not None:
-        scenario = _with_auxiliary(scenario, auxiliary)
-    asked = scenario.settings
-    settings = asked.model_copy(
-        update={
-            "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
-            "protocol": asked.protocol.model_copy(
-                update={"kind": protocol or asked.protocol.kind or DEFAULT_PROTOCOL, "estimates": estimates or asked.protocol.estimates}
-            ),
-            "smoothing": smoothing or asked.smoothing,
-        }
-    )
+    given = {
+        "protocol": protocol, "estimates": estimates, "seed": seed, "start": start, "smoothing": smoothing,
+        "until": until, "rounds": rounds, "stop": stop, "loss": loss, "sleep": sleep, "rate": rate, "speed": speed,
+        "auxiliary": auxiliary, "record": record, "agents": agents, "every": every,
+    }  # fmt: skip
+    if checkpoint is not None and out is None:
+        raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
+    files = None if out is None else Files(Path(out), checkpoint)
+    return _start(_scenario(team), given, files, full, progress)
+
+
+def resume(
+    out: str | os.PathLike[str],
+    team: Team | None = None,
+    *,
+    rounds: int | None = None,
+    until: float | None = None,
+    checkpoint: float | None = None,
+    full: bool = False,
+    progress: Callable[[float, float], None] = lambda *_: None,
+) -> Result:
+    """Go on, bit for bit, where a run with `checkpoint` was interrupted, by whatever.
+
+    Args:
+        out: the directory of that run.
+        team: the same team, if it holds functions that no file can hold.
+        rounds: end after so many instead, counted from the start.
+        until: end of a flow instead, s.
+        checkpoint: seconds between two checkpoints; as before if None.
+        full: see `run`.
+        progress: see `run`.
+
+    Raises:
+        InvalidResult: there is no checkpoint, it cannot be read, or it is of another problem.
+    """
+    files = Files(Path(out), checkpoint, checkpoints.read(Path(out) / checkpoints.NAME))
+    about = files.about
+    given = dict(about["given"]) | {key: value for key, value in (("rounds", rounds), ("until", until)) if value is not None}
+    if given["smoothing"] not in (None, "auto"):
+        given["smoothing"] = Smoothing.model_validate(given["smoothing"])
+    if team is None and not about["scenario"]:
+        raise InvalidSettings(f"{out}: the team of this run holds Python functions; give resume the same team")
+    scenario = _scenario(team) if team is not None else loads(about["scenario"], about["name"])
+    return _start(scenario, given, files, full, progress)
+
+
+def _start(
+    scenario: Scenario, given: Mapping[str, Any], files: Files | None, full: bool, progress: Callable[[float, float], None]
+) -> Result:
+    """Check the settings, and run; `given` are the arguments of `run`."""
+    about = {"scenario": scenario.text, "name": scenario.source, "given": {key: _as_data(value) for key, value in given.items()}}
+    if given["auxiliary"] is not None:
+        scenario = _with_auxiliary(scenario, given["auxiliary"])
+    settings = _settings(scenario.settings, given)
     kind = settings.protocol.kind
     if kind not in FLOWS and kind not in ROUNDS:
         raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
-    stop = stop or ("never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied")
-    options: dict[str, Any] = {"stop": stop, "record": record, "progress": progress}
+    until, rounds, loss, sleep, rate, speed = (given[key] for key in ("until", "rounds", "loss", "sleep", "rate", "speed"))
+    default = "never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied"
+    options: dict[str, Any] = {"stop": given["stop"] or default, "progress": progress}
+    keep = _Keep(given["agents"], given["record"], given["every"], files, about)
     if kind in FLOWS:
         _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
-        return _run(scenario, settings, full, functools.partial(_flow, settings.protocol, until=until, **options))
+        return _run(scenario, settings, full, keep, functools.partial(_flow, settings.protocol, until=until, **options))
     _refuse(f"protocol {kind} goes in rounds; use rounds", until=until)
     if (speed is not None and rate is None) or not all(value is None or value > 0 for value in (speed, rate)):
         raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
@@ -117,8 +173,29 @@ def run(
         raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
     weather = Weather(loss, sleep, settings.start.seed)
     body = None if rate is None else Body(rate, np.inf if speed is None else speed)
-    return _run(
-        scenario, settings, full, functools.partial(_rounds, settings.protocol, rounds=rounds, weather=weather, body=body, **options)
+    simulate = functools.partial(_rounds, settings.protocol, rounds=rounds, weather=weather, body=body, **options)
+    return _run(scenario, settings, full, keep, simulate)
+
+
+def _as_data(value: Any) -> Any:
+    """An argument of `run` as JSON can hold it."""
+    if isinstance(value, Smoothing):
+        return value.model_dump(by_alias=True)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if isinstance(value, str) or not isinstance(value, Sequence) else [_as_data(each) for each in value]
+
+
+def _settings(asked: Settings, given: Mapping[str, Any]) -> Settings:
+    """What the scenario asks for, and `given` overrides."""
+    start, seed = given["start"], given["seed"]
+    kind, estimates = given["protocol"] or asked.protocol.kind or DEFAULT_PROTOCOL, given["estimates"] or asked.protocol.estimates
+    return asked.model_copy(
+        update={
+            "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
+            "protocol": asked.protocol.model_copy(update={"kind": kind, "estimates": estimates}),
+            "smoothing": given["smoothing"] or asked.smoothing,
+        }
     )
 
 
@@ -137,13 +214,36 @@ class _Prepared(NamedTuple):
     first: np.ndarray
 
 
+@dataclasses.dataclass(frozen=True)
+class _Keep:
+    """What is kept of a run, and where; `agents`, `record` and `every` as in `run`, `about` what `resume` must know."""
+
+    agents: Who
+    record: bool | None
+    every: int
+    files: Files | None
+    about: Mapping[str, Any]
+
+    def options(self, team: Team, copies: Estimates, clock: str) -> dict[str, Any]:
+        """Arguments of `simulate_rounds` and `simulate_flow`."""
+        choice = Choice.of(team, copies, self.agents, self.record, self.every)
+        if self.files is None:
+            return {"choice": choice}
+        return {"choice": choice, "sink": self.files.sink(team, copies, choice, clock), "checkpoint": self.files.checkpoints(self.about)}
+
+
 @float64
-def _run(scenario: Scenario, settings: Settings, full: bool, simulate: Callable[[_Prepared], Trace]) -> Result:
+def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simulate: Callable[..., Trace]) -> Result:
     team = scenario.team
     copies, size = Estimates.of(team, settings.protocol.estimates), scale(team)
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    trace = simulate(_Prepared(team, copies, schedule, size, first_estimates(team, copies, settings.start, size)))
+    first = first_estimates(team, copies, settings.start, size)
+    options = keep.options(team, copies, "time" if settings.protocol.kind in FLOWS else "round")
+    trace = simulate(_Prepared(team, copies, schedule, size, first), **options)
     summary = summarise(scenario, settings, schedule, size, trace, full)
+    if keep.files is not None:
+        summary["result"] = str(keep.files.directory / RESULT)
+        trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
@@ -224,15 +324,21 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) ->
                 f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team"
             )
     random = np.random.default_rng(start.seed)
-    drawn = random.uniform(low, high, (team.count, d))
-    first = random.uniform(low, high, (copies.count, d))
+    where = (team.count, d), (copies.count, d)
+    drawn, first = (random.uniform(low, high, shape) for shape in where)
+    if team.around is not None:  # what the box gives, moved into the box that each has of its own
+        place, reach = team.around
+        half = np.where(high > low, (high - low) / 2, 1.0)
+        for values, whose in ((drawn, slice(None)), (first, copies.position)):
+            near = place[whose] + reach[whose][:, None] * (values - (low + high) / 2) / half
+            values[...] = np.where(np.isnan(near), values, near)
     first[copies.own] = np.where(np.isnan(team.starts), drawn, team.starts)
     return first
 
 
 def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
     """What ``run --json`` prints (schema consat.run/1)."""
-    team, position = scenario.team, trace.position[-1]
+    team, position = scenario.team, trace.end
     nu = schedule.final
     margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
     margin = _number(margins.min(initial=np.inf))
@@ -256,7 +362,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
             "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
         },
         "known_from": trace.known_from,
-        "rounds": len(trace.steps) - 1 if trace.clock == "round" else None,
+        "rounds": int(trace.steps[-1]) if trace.clock == "round" else None,
         "time": float(trace.steps[-1]) if trace.clock == "time" else None,
         "ending": trace.ending,
         "messages": trace.messages,
@@ -308,8 +414,7 @@ def _status(trace: Trace, margin: float | None, verdict: str, length: float) -> 
         return "diverged"
     if margin is not None and margin > 0:
         return "satisfied"
-    lately = trace.position[-min(10, len(trace.position)) :]
-    arrived = len(trace.position) > 10 and np.abs(lately - lately[-1]).max(initial=0.0) <= AT_REST * length
+    arrived = trace.moved_lately <= AT_REST * length
     return "least-violating" if verdict == "infeasible" and arrived else "not-converged"
 
 

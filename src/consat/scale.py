@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.constraints.curvature import expand
-from consat.numerics import float64
+from consat.family import Family
+from consat.numerics import float64, once
 from consat.settings import Smoothing
-from consat.team import Family, Team
+from consat.team import Team
 
 SHARPNESS = 5.0
 """ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
@@ -47,9 +48,10 @@ class Scale(NamedTuple):
         return MARGIN * self.length + self.spread
 
 
+@functools.lru_cache(maxsize=16)
 @float64
 def scale(team: Team) -> Scale:
-    """Measure a team; 1 where nothing says otherwise."""
+    """Measure a team; 1 where nothing says otherwise. A team is measured once."""
     measured = [_measure(family, team.dimension) for family in team.families]
     psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
     bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
@@ -94,10 +96,13 @@ def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np
         value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
     except ValueError:  # beyond degree 2: to second order about the origin
         value, b, hessian = (np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters)))
-    usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & np.isfinite(hessian).all(axis=(1, 2))
-    value, b, hessian = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (value, b, hessian))
-    stationary = -np.einsum("mij,mj->mi", np.linalg.pinv(hessian, hermitian=True), b)
-    bend = np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0)
+    hessian = once(hessian)
+    finite = np.isfinite(hessian).all(axis=(1, 2))
+    usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & finite
+    hessian = np.where(np.asarray(finite)[:, None, None], hessian, 0.0)
+    value, b = np.where(usable, value, 0.0), np.where(usable[:, None], b, 0.0)
+    stationary = -np.matmul(np.linalg.pinv(hessian, hermitian=True), b[..., None])[..., 0]
+    bend = np.where(usable, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
     psi_there = np.abs(value + 0.5 * np.einsum("mi,mi->m", b, stationary)) * family.weight
     centers = stationary[(bend > 0)] if family.arity == 1 else np.zeros((0, dimension))
     return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-import math
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -14,23 +12,25 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter
+from consat.constraints.record import OWNER, Constraint, Number
 from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.family import Counted, Family, Joined, Part, assemble, distinct
+from consat.groups import Expansion, Group, faults_of, stems_clash
 from consat.numerics import float64
+from consat.parameters import Path, checked, vector
 
 if TYPE_CHECKING:
     import networkx as nx
 
-LARGEST = 1e100
-"""Numbers beyond this are refused: their squares must stay finite in float64."""
-
 SUGGESTIONS = 20
 """Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
 
+MOST_NAMED = 100_000
+"""Up to so many constraints have their names made at once; of more, a name is made when asked for."""
+
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
-Path = tuple[str | int, ...]
-Links: TypeAlias = "str | nx.Graph | Iterable[tuple[str, str]]"
+Links: TypeAlias = "str | nx.Graph | np.ndarray | Iterable[tuple[str, str]]"
 
 
 @dataclass(frozen=True)
@@ -48,45 +48,12 @@ class Agent:
     start: ArrayLike | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Family:
-    """M constraints that share one function ψ, with stacked parameters; evaluated by one `jax.vmap`.
-
-    Attributes:
-        kind: the name errors and reports use.
-        psi: ``psi(*positions, **parameters) -> scalar``.
-        agents: (M, arity) whose positions ψ takes.
-        owner: (M,) whose constraint it is.
-        number: (M,) place in the team's order of constraints, which is by owner.
-        parameters: arrays with leading axis M.
-        weight: (M,) positive factors on ψ.
-        sources: (M,) the texts, if they were written as text expressions, else None.
-    """
-
-    kind: str
-    psi: Callable[..., Any]
-    agents: np.ndarray
-    owner: np.ndarray
-    number: np.ndarray
-    parameters: Mapping[str, np.ndarray]
-    weight: np.ndarray
-    sources: Sequence[str] | None = None
-
-    @property
-    def size(self) -> int:
-        return len(self.owner)
-
-    @property
-    def arity(self) -> int:
-        return int(self.agents.shape[1])
-
-
 class Team:
     """N agents in R^d, their constraints and who can talk to whom.
 
     Args:
-        agents: the agents, at least one.
-        links: who talks to whom: pairs of ids, a `networkx.Graph` over ids, or one of `TOPOLOGIES`
+        agents: the agents, at least one; a `Group` stands for many.
+        links: who talks to whom: pairs of ids, a `networkx.Graph` over ids, an (L, 2) array of places in `ids`, or one of `TOPOLOGIES`
             (``task`` links agents along the task graph, the default).
         dimension: d ≥ 1.
 
@@ -100,6 +67,9 @@ class Team:
         names: (M,) their names.
         links: (L, 2) int32, i < j, each link once.
         starts: (N, d), NaN where an agent has no start of its own.
+        around: (N, d) and (N,): near which place, and how near on every axis, a member of a group begins, and what others first think of
+            it; NaN where nobody says. None if nobody says of anyone.
+        members: the agents and groups as given; None if the constraints have been changed since.
         dimension: d.
     """
 
@@ -109,41 +79,65 @@ class Team:
     names: Sequence[str]
     links: np.ndarray
     starts: np.ndarray
+    around: tuple[np.ndarray, np.ndarray] | None
+    members: tuple[Agent | Group, ...] | None
     dimension: int
 
-    def __init__(self, agents: Iterable[Agent], links: Links = "task", dimension: int = 2) -> None:
-        agents = list(agents)
+    def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2) -> None:
+        self.members = tuple(agents)
         faults: list[Fault] = []
         if isinstance(dimension, bool) or not isinstance(dimension, int | np.integer) or not 1 <= dimension <= 64:
             faults.append(Fault(("dimension",), f"dimension is {dimension!r}, but must be a whole number from 1 to 64", "dimension"))
             dimension = 0
-        if not agents:
+        if not self.members:
             faults.append(Fault(("agents",), "a team needs at least one agent", "agents"))
-        index = _index(agents, faults)
-        self.ids = tuple(agent.id for agent in agents)
         self.dimension = int(dimension)
-        self.starts = np.full((len(agents), self.dimension), np.nan)
-        entries = list(_entries(agents, index, self.dimension, faults))
+        index = Index(self.members, self.dimension, faults)
+        self.ids = index.ids
+        self.starts = np.full((index.count, self.dimension), np.nan)
+        self.around = None
+        entries = list(_entries(index, self.dimension, faults))
+        parts = _alike(entries)
         if dimension:
             _trace(entries, self.dimension, faults)
-            for i, agent in enumerate(agents):
+            for k, i, agent in index.singles:
                 if agent.start is not None:
-                    start = _vector(agent.start, self.dimension, ("agents", i, "start"), "start", _who(i, agent.id), faults)
+                    start = vector(agent.start, self.dimension, ("agents", k, "start"), "start", _who(k, agent.id), faults)
                     self.starts[i] = np.nan if start is None else start
+            for k, i, group in index.groups:
+                parts += self._expand(group, i, index, ("agents", k), faults)
         pairs = _pairs(links, index, faults)
         if faults:
             distinct = {(fault.path, fault.message): fault for fault in reversed(faults)}
             raise InvalidTeam(sorted(distinct.values(), key=lambda fault: tuple(map(_sortable, fault.path))))
-        self.owner = np.array([entry.owner for entry in entries], dtype=np.int32)
-        self.names = tuple(entry.name for entry in entries)
-        self.families = _families(entries)
-        self.links = _unique(pairs) if pairs is not None else topology(cast(str, links), len(agents), self.families)
+        self.families, self.owner, self.names = assemble(parts)
+        if len(self.names) <= MOST_NAMED:
+            self.names = tuple(self.names)
+        self.links = _unique(pairs, self.count) if pairs is not None else topology(cast(str, links), self.count, self.families)
+
+    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[Part]:
+        expansion = Expansion(group, first, index.ids, index.get, self.dimension, path, faults)
+        mine = slice(first, first + group.count)
+        if group.start is not None:
+            self.starts[mine] = group.start
+        if group.scatter is not None:
+            if self.around is None:
+                self.around = np.full_like(self.starts, np.nan), np.full(len(self.starts), np.nan)
+            self.around[0][mine], self.around[1][mine] = expansion.layout.places, group.scatter
+        made = expansion.parts()
+        entries = [
+            _Entry(constraint, first, tuple(range(part.agents.shape[1])), "", at, where, {k: v[0] for k, v in part.parameters.items()})
+            for part, constraint, at, where in made
+            if len(part.owner)
+        ]
+        _trace(entries, self.dimension, faults)
+        return [part for part, *_ in made if len(part.owner)]
 
     def with_constraints(self, families: Iterable[Family], owner: np.ndarray, names: Sequence[str]) -> Team:
         """The same agents and links with other constraints, which are known to fit; see the attributes of `Team`."""
         team = copy.copy(self)
         team.__dict__.pop("constraints_per_agent", None)
-        team.families, team.owner, team.names = tuple(families), owner, names
+        team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
 
     @property
@@ -179,30 +173,97 @@ class _Entry:
         return self.constraint.psi, len(self.agents), shapes
 
 
-def _index(agents: Sequence[Agent], faults: list[Fault]) -> dict[str, int]:
-    index: dict[str, int] = {}
-    for i, agent in enumerate(agents):
-        path: Path = ("agents", i, "id")
-        if not isinstance(agent.id, str) or not agent.id.strip() or not agent.id.isprintable():
-            faults.append(Fault(path, f"id is {agent.id!r}, but must be a printable text such as 'a1'", f"agents[{i}]"))
-        elif agent.id in index:
-            message = f"id {agent.id!r} is taken by agents[{index[agent.id]}]; every agent needs an id of its own"
-            faults.append(Fault(path, message, f"agents[{i}]"))
-        else:
-            index[agent.id] = i
-    return index
+class Index:
+    """Which agent has which id.
+
+    Args:
+        members: agents and groups.
+        dimension: of the team, 0 if that is a fault.
+        faults: found so far; what is wrong with ids and groups is added.
+
+    Attributes:
+        ids: of all.
+        singles: (place among the members, place in the team, agent) of each agent, …
+        groups: … and of each group that has no faults of its own.
+    """
+
+    def __init__(self, members: Sequence[Agent | Group], dimension: int, faults: list[Fault]) -> None:
+        self.singles: list[tuple[int, int, Agent]] = []
+        self.groups: list[tuple[int, int, Group]] = []
+        self.places: dict[str, int] = {}
+        self.ranges: list[tuple[int, Counted]] = []
+        ids: list[Sequence[str]] = []
+        numbers: dict[str, int] = {}
+        self.count = 0
+        for k, member in enumerate(members):
+            if isinstance(member, Group):
+                self._take(member, k, dimension, faults, ids)
+                continue
+            self.singles.append((k, self.count, member))
+            path: Path = ("agents", k, "id")
+            if not isinstance(member.id, str) or not member.id.strip() or not member.id.isprintable():
+                faults.append(Fault(path, f"id is {member.id!r}, but must be a printable text such as 'a1'", f"agents[{k}]"))
+            elif member.id in numbers:
+                message = f"id {member.id!r} is taken by agents[{numbers[member.id]}]; every agent needs an id of its own"
+                faults.append(Fault(path, message, f"agents[{k}]"))
+            else:
+                self.places[member.id], numbers[member.id] = self.count, k
+            ids.append((member.id,))
+            self.count += 1
+        for k, _, agent in self.singles:
+            if any(counted.find(agent.id) is not None for _, counted in self.ranges):
+                message = f"id {agent.id!r} is taken by a member of a group; every agent needs an id of its own"
+                faults.append(Fault(("agents", k, "id"), message, f"agents[{k}]"))
+        self.ids: Sequence[str] = Joined(ids) if self.groups else tuple(agent.id for _, _, agent in self.singles)
+
+    def _take(self, group: Group, k: int, dimension: int, faults: list[Fault], ids: list[Sequence[str]]) -> None:
+        found = faults_of(group, ("agents", k), dimension) if dimension else []
+        counted = Counted(group.name, 0 if found else group.count)
+        clashes = [] if found else [clash for _, other in self.ranges if (clash := stems_clash(other, counted)) is not None]
+        if clashes:
+            message = f"its member {clashes[0]!r} has the id of another group's; choose another name"
+            found = [Fault(("agents", k, "group"), message, f"group {group.name!r}")]
+        faults += found
+        if not found and dimension:
+            self.groups.append((k, self.count, group))
+            self.ranges.append((self.count, counted))
+            ids.append(counted)
+            self.count += group.count
+
+    def get(self, agent: object) -> int | None:
+        """The place in the team of an id, or None."""
+        if not isinstance(agent, str):
+            return None
+        if agent in self.places:
+            return self.places[agent]
+        return next((first + place for first, ids in self.ranges if (place := ids.find(agent)) is not None), None)
+
+    def __contains__(self, agent: object) -> bool:
+        return self.get(agent) is not None
+
+    def __getitem__(self, agent: str) -> int:
+        place = self.get(agent)
+        if place is None:
+            raise KeyError(agent)
+        return place
+
+    def known(self) -> Iterator[str]:
+        """Ids to suggest: of a group only the first few."""
+        yield from self.places
+        for _, ids in self.ranges:
+            yield from ids[:SUGGESTIONS]
 
 
 def _who(i: int, name: Any) -> str:
     return f"agent {name!r}" if isinstance(name, str) and name.strip() else f"agents[{i}]"
 
 
-def _entries(agents: Sequence[Agent], index: Mapping[str, int], dimension: int, faults: list[Fault]) -> Iterator[_Entry]:
-    for i, agent in enumerate(agents):
+def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[_Entry]:
+    for number, i, agent in index.singles:
         taken: dict[str, int] = {}
-        who = _who(i, agent.id)
+        who = _who(number, agent.id)
         for k, item in enumerate(agent.constraints):
-            path: Path = ("agents", i, "constraints", k)
+            path: Path = ("agents", number, "constraints", k)
             for constraint in _flatten(item):
                 if not isinstance(constraint, Constraint):
                     faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", who))
@@ -213,10 +274,10 @@ def _entries(agents: Sequence[Agent], index: Mapping[str, int], dimension: int, 
                 reads = _reads(constraint, agent.id, index, path, where, faults)
                 entry = _Entry(constraint, i, reads, name, path, where)
                 for key, parameter in constraint.parameters.items():
-                    value = _parameter(parameter, dimension, (*path, key), key, where, faults)
+                    value = checked(parameter, dimension, (*path, key), key, where, faults)
                     if value is not None:
                         entry.values[key] = value
-                weight = _parameter(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
+                weight = checked(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
                 entry.weight = 1.0 if weight is None else float(weight)
                 if len(faults) == named and reads:
                     yield entry
@@ -251,7 +312,7 @@ def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str,
     return name
 
 
-def _reads(constraint: Constraint, owner: str, index: Mapping[str, int], path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
+def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
     key: Path = ("psi",) if constraint.source is not None else ("agent",)
     reads: list[str] = []
     for agent in constraint.reads:
@@ -267,62 +328,6 @@ def _reads(constraint: Constraint, owner: str, index: Mapping[str, int], path: P
         itself = "its own owner" if repeated == owner else "the same agent twice"
         faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
     return tuple(index[agent] for agent in reads)
-
-
-def _parameter(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    if isinstance(parameter, Fixed):
-        try:
-            return np.asarray(parameter.value, dtype=float)
-        except (TypeError, ValueError):
-            faults.append(Fault(path, f"{key} must be a number or an array of numbers, but is {parameter.value!r}", where))
-            return None
-    if isinstance(parameter, Number):
-        return _number(parameter, path, key, where, faults)
-    value = _vector(parameter.value, dimension, path, key, where, faults)
-    if value is not None and parameter.nonzero and not np.any(value):
-        faults.append(Fault(path, f"{key} is zero, but must point somewhere", where))
-    if value is not None and parameter.above is not None:
-        low = _vector(parameter.above, dimension, (*path[:-1], "low"), "low", where, faults)
-        if low is not None and not np.all(value > low):
-            faults.append(Fault(path, f"{key} is {value.tolist()}, but must be above low {low.tolist()} on every axis", where))
-    return value
-
-
-def _limit(value: Any) -> str:
-    return f" of size at most {LARGEST:g}" if _is_number(value) and abs(value) > LARGEST else ""
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-
-
-def _number(parameter: Number, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    value = parameter.value
-    want = "a positive number" if parameter.positive else "a number"
-    if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
-        value = value.item()
-    if not _is_number(value) or not math.isfinite(value) or abs(value) > LARGEST:
-        faults.append(Fault(path, f"{key} is {shown(value)}, but must be {want}{_limit(value)}", where))
-        return None
-    if parameter.positive and value < 1 / LARGEST:
-        faults.append(Fault(path, f"{key} is {value!r}, but must be {want}", where))
-        return None
-    return np.asarray(float(value))
-
-
-def _vector(value: Any, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    entries = value.tolist() if isinstance(value, np.ndarray | jax.Array) else value
-    numbers = f"{dimension} number" + ("s" if dimension > 1 else "")
-    if not isinstance(entries, list | tuple):
-        faults.append(Fault(path, f"{key} is {shown(value)}, but must be a list of {numbers}", where))
-    elif dimension and len(entries) != dimension:
-        message = f"{key} has {len(entries)} entries, but must have {dimension}, one for each dimension of the team"
-        faults.append(Fault(path, message, where))
-    elif bad := [entry for entry in entries if not _is_number(entry) or not math.isfinite(entry) or abs(entry) > LARGEST]:
-        faults.append(Fault(path, f"{key} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}", where))
-    else:
-        return np.array(entries, dtype=float)
-    return None
 
 
 @float64
@@ -365,26 +370,27 @@ def _mistake(entry: _Entry, dimension: int) -> tuple[str, int]:
     return "", 0
 
 
-def _families(entries: Sequence[_Entry]) -> tuple[Family, ...]:
-    members: dict[tuple[Any, ...], list[int]] = defaultdict(list)
-    for number, entry in enumerate(entries):
-        members[entry.family].append(number)
-    families = []
-    for numbers in members.values():
-        group = [entries[number] for number in numbers]
-        families.append(
-            Family(
-                kind=group[0].constraint.kind,
-                psi=group[0].constraint.psi,
-                agents=np.array([entry.agents for entry in group], dtype=np.int32),
-                owner=np.array([entry.owner for entry in group], dtype=np.int32),
-                number=np.array(numbers, dtype=np.int32),
-                parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
-                weight=np.array([entry.weight for entry in group]),
-                sources=_sources(group),
-            )
+def _alike(entries: Sequence[_Entry]) -> list[Part]:
+    """Constraints that share a family, together."""
+    members: dict[tuple[Any, ...], list[_Entry]] = {}
+    turns: dict[tuple[Any, ...], list[int]] = {}
+    for turn, entry in enumerate(entries):
+        members.setdefault(entry.family, []).append(entry)
+        turns.setdefault(entry.family, []).append(turn)
+    return [
+        Part(
+            kind=group[0].constraint.kind,
+            psi=group[0].constraint.psi,
+            agents=np.array([entry.agents for entry in group], dtype=np.int32),
+            owner=np.array([entry.owner for entry in group], dtype=np.int32),
+            parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
+            weight=np.array([entry.weight for entry in group]),
+            names=tuple(entry.name for entry in group),
+            sources=_sources(group),
+            turn=np.array(turns[family]),
         )
-    return tuple(families)
+        for family, group in members.items()
+    ]
 
 
 def _sources(entries: Sequence[_Entry]) -> tuple[str, ...] | None:
@@ -392,12 +398,18 @@ def _sources(entries: Sequence[_Entry]) -> tuple[str, ...] | None:
     return texts if len(texts) == len(entries) else None
 
 
-def _pairs(links: Links, index: Mapping[str, int], faults: list[Fault]) -> np.ndarray | None:
+def _pairs(links: Links, index: Index, faults: list[Fault]) -> np.ndarray | None:
     """Links as pairs of indices, or None for a named topology."""
     if isinstance(links, str):
         if links not in TOPOLOGIES:
             choices = ", ".join(TOPOLOGIES)
             faults.append(Fault(("communication", "graph"), f"there is no graph {links!r}; choose one of {choices}", "communication"))
+        return None
+    if isinstance(links, np.ndarray) and links.dtype.kind in "iu":
+        if links.ndim == 2 and links.shape[1] == 2 and (not links.size or (links.min() >= 0 and links.max() < index.count)):
+            return links
+        message = f"an array of links must have shape (L, 2) and hold places from 0 to {index.count - 1}"
+        faults.append(Fault(("communication", "links"), message, "communication"))
         return None
     pairs = []
     for k, link in enumerate(getattr(links, "edges", links)):
@@ -417,7 +429,7 @@ def _pairs(links: Links, index: Mapping[str, int], faults: list[Fault]) -> np.nd
 
 def topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
     """The links of one of `TOPOLOGIES`, (L, 2) int32, i < j, each once."""
-    return _unique(_topology(kind, count, families))
+    return _unique(_topology(kind, count, families), count)
 
 
 def _topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
@@ -434,13 +446,14 @@ def _topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
     return np.concatenate([np.zeros((0, 2), dtype=np.int32), *pairs])
 
 
-def _unique(pairs: np.ndarray) -> np.ndarray:
-    pairs = np.sort(pairs, axis=1)
-    return np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0)
+def _unique(pairs: np.ndarray, count: int) -> np.ndarray:
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    keys = distinct((low.astype(np.int64) * count + high)[low < high])
+    return np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1).astype(np.int32)
 
 
-def _unknown(agent: Any, index: Mapping[str, int], faults: Sequence[Fault]) -> str:
-    hint = closest(agent, index) if len(faults) < SUGGESTIONS else ""
+def _unknown(agent: Any, index: Index, faults: Sequence[Fault]) -> str:
+    hint = closest(agent, index.known()) if len(faults) < SUGGESTIONS else ""
     return f"there is no agent {shown(agent)}{hint}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,10 @@ class Trace:
         known_from: the round from which every agent knew that all were satisfied; None in continuous time, or if they don't.
         seconds: spent on ``compile`` and ``run``.
         period: of a round, s; None in continuous time, and where rounds take no time.
+        recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
+        final: (N, d) everyone's last positions, where not all were recorded.
+        drift: how far any agent moved, on any axis, over the last ten steps of the run; None to read it off `position`.
+        file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
     clock: Literal["time", "round"]
@@ -57,6 +62,23 @@ class Trace:
     known_from: int | None
     seconds: Mapping[str, float]
     period: float | None = None
+    recorded: np.ndarray | None = None
+    final: np.ndarray | None = None
+    drift: float | None = None
+    file: Path | None = None
+
+    @property
+    def end(self) -> np.ndarray:
+        """(N, d) everyone's last positions."""
+        return self.position[-1] if self.final is None else self.final
+
+    @property
+    def moved_lately(self) -> float:
+        """How far any agent moved, on any axis, over the last ten steps; ∞ for a run that has not been so long."""
+        if self.drift is not None:
+            return self.drift
+        lately = self.position[-10:]
+        return float(np.abs(lately - lately[-1]).max(initial=0.0)) if len(self.position) > 10 else np.inf
 
 
 def satisfied_from(steps: np.ndarray, margin: np.ndarray, *, interpolate: bool) -> float | None:

@@ -18,7 +18,8 @@ from consat.objective import Nu
 from consat.protocols import Admm, Proximal
 from consat.reference import max_min
 from consat.scale import scale
-from consat.simulate.rounds import Weather, _world, simulate_rounds
+from consat.simulate.kernel import Weather, world_of
+from consat.simulate.rounds import simulate_rounds
 from tests.unit import teams
 
 SEEDS = range(10)
@@ -88,8 +89,8 @@ def _against_recursion(protocol: Any, mix: Callable[[np.ndarray, np.ndarray], np
     team = teams.case("c")
     copies, nu = Estimates.of(team, "local"), Nu(5.0, 5.0)
     first = np.random.default_rng(5).uniform(-4, 4, (copies.count, 2))
-    trace = simulate_rounds(team, protocol, copies, nu, scale(team), first, convex=True, rounds=30, stop="never")
-    everyone = _world(team, copies, nu, scale(team), convex=True, weather=Weather(), body=None, record=True).everyone
+    trace = simulate_rounds(team, protocol, copies, nu, 1.0, first, convex=True, rounds=30, stop="never")
+    everyone = world_of(team, copies, nu, scale(team), convex=True, weather=Weather(), body=None).everyone
     adjacency = np.zeros((copies.count, copies.count))
     adjacency[tuple(copies.edges.T)] = 1.0
     W, weight = mix(adjacency, adjacency.sum(axis=1)), jnp.asarray(kappa(adjacency.sum(axis=1)))

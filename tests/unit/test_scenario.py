@@ -60,7 +60,7 @@ def best_margin(team: cs.Team) -> float:
 
 
 def test_packaged_names() -> None:
-    assert packaged() == (*CASES, "example-1")
+    assert packaged() == (*CASES, "convoy", "example-1", "lattice", "swarm")
 
 
 @pytest.mark.parametrize("name", packaged())

@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from consat.constraints.composition import Node, arranged, block, constant, highest, opaque, position, signs
 from consat.constraints.tracing import CALLS, describe, evaluate, interpret
+from consat.numerics import once, stacked
 
 Array = NDArray[Any]
 Psi = Callable[..., Any]
@@ -133,12 +134,14 @@ def read_curvatures(
     family = _Family.of(psi, arity, dimension, stacked_parameters, members)
     nodes = family.nodes()
     parts = [_classify(node, arity, count) for count, node in nodes]
-    code, strict_in = (np.concatenate(part) for part in zip(*parts, strict=True))
+    code, strict_in = (stacked(part) for part in zip(*parts, strict=True))
     undecided = np.flatnonzero(code == _UNKNOWN)
     if undecided.size:
+        code = np.array(code)
         code[undecided[_refuted(family, undecided)]] = _NOT
     degrees = [None if node.terms is None else node.degree for _, node in nodes]
-    return Readings(_LABELS[code], strict_in, highest(degrees))
+    labels = _repeated(_LABELS[once(code)], len(code))
+    return Readings(labels, strict_in, highest(degrees))
 
 
 def degree(psi: Psi, arity: int, dimension: int, example_parameters: Mapping[str, ArrayLike]) -> int | None:
@@ -170,7 +173,7 @@ def expand(psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[str
         flat = [part.reshape(len(part), *(n,) * order) for order, part in enumerate(node.terms)]
         shapes = [(count, *(n,) * order) for order in range(3)]
         chunks.append([np.broadcast_to(part, shape) for part, shape in zip_longest(flat, shapes, fillvalue=np.zeros(()))])
-    return Quadratics(*(part[0] if len(part) == 1 else np.concatenate(part) for part in zip(*chunks, strict=True)))
+    return Quadratics(*(stacked(part) for part in zip(*chunks, strict=True)))
 
 
 def hessians(psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[str, ArrayLike], members: int | None = None) -> Array:
@@ -241,6 +244,7 @@ def _classify(node: Node, arity: int, members: int) -> tuple[Array, Array]:
 
 
 def _repeated(array: Array, members: int) -> Array:
+    """One row, or as many as there are members, as so many."""
     return np.broadcast_to(array, (members, *array.shape[1:]))
 
 

@@ -6,7 +6,7 @@ To add a kind, write the same two things and list the factory.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 
 from consat.constraints.expression import Expression
 from consat.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
+
+Other: TypeAlias = "str | int | Sequence[int] | Mapping[str, int] | np.ndarray"
+"""Whom a constraint reads besides its owner."""
 
 
 def _within(x: Array, *, center: Array, radius: Array) -> Array:
@@ -53,11 +56,11 @@ def _near(x: Array, y: Array, *, radius: Array) -> Array:
     return radius**2 - jnp.sum((x - y) ** 2)
 
 
-def near(agent: str, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+def near(agent: Other, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
     """Stay near a teammate: ψ = r² − ‖x_i − x_j‖² (paper, case A). Concave.
 
     Args:
-        agent: id of j.
+        agent: id of j; in a group also a relation, see `consat.groups`.
         radius: r > 0, length.
         name: what reports call it.
         weight: positive factor on ψ.
@@ -69,11 +72,11 @@ def _apart(x: Array, y: Array, *, radius: Array) -> Array:
     return jnp.sum((x - y) ** 2) - radius**2
 
 
-def apart(agent: str, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+def apart(agent: Other, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
     """Keep a distance from a teammate: ψ = ‖x_i − x_j‖² − r² (paper, case E). Not concave.
 
     Args:
-        agent: id of j.
+        agent: id of j; in a group also a relation, see `consat.groups`.
         radius: r > 0, length.
         name: what reports call it.
         weight: positive factor on ψ.
@@ -85,11 +88,11 @@ def _displacement(x: Array, y: Array, *, vector: Array, radius: Array) -> Array:
     return radius**2 - jnp.sum((x - y - vector) ** 2)
 
 
-def displacement(agent: str, vector: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+def displacement(agent: Other, vector: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
     """Hold a place relative to a teammate: ψ = r² − ‖x_i − x_j − v‖². Concave.
 
     Args:
-        agent: id of j.
+        agent: id of j; in a group also a relation, see `consat.groups`.
         vector: v, shape (d,), length: where i should be, seen from j.
         radius: r > 0, length.
         name: what reports call it.

@@ -10,7 +10,8 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from consat.constraints import KINDS
-from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.groups import MOST, Each, Group
 from consat.scenario.document import Document, Path
 from consat.scenario.words import complaints, unknown_key
 from consat.settings import Settings
@@ -18,8 +19,11 @@ from consat.team import Agent, Links, Team
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
-KEYS: Final = ("consat", "name", "dimension", "agents", "communication", *SETTINGS)
+KEYS: Final = ("consat", "name", "dimension", "count", "agents", "communication", *SETTINGS)
 AGENT_KEYS: Final = ("id", "start", "constraints")
+GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
+MEMBER_KEYS: Final = ("of", "agent")
+"""Keys that constraints of a group have besides those of their kind."""
 COMMUNICATION_KEYS: Final = ("links", "graph")
 
 
@@ -63,7 +67,7 @@ def build(document: Document) -> tuple[Team, Settings, str | None]:
         faults.add(("name",), f"name is {shown(name)}, but must be a printable text; put numbers in quotes")
     dimension = data.get("dimension", 2)
     settings = _settings({key: data[key] for key in SETTINGS if key in data}, dimension, faults)
-    agents = _agents(data.get("agents"), faults)
+    agents = _agents(data.get("agents"), data.get("count"), faults)
     links = _links(data.get("communication"), faults)
     team = None
     try:
@@ -122,15 +126,21 @@ def _links(data: Any, faults: _Faults) -> Links:
     return links
 
 
-def _agents(data: Any, faults: _Faults) -> list[Agent]:
-    """The agents one by one; whatever stands for many agents at once will join them here."""
+def _agents(data: Any, count: Any, faults: _Faults) -> list[Agent | Group]:
+    """Agents and groups; `count` is that of groups that have none of their own."""
     if data is None:
         faults.add(("agents",), "agents is missing; it must be a list such as [{id: a1, constraints: [..]}]")
-    elif not isinstance(data, list):
+        return []
+    if not isinstance(data, list):
         faults.add(("agents",), f"agents is {shown(data)}, but must be a list such as [{{id: a1, constraints: [..]}}]")
-    else:
-        return [_agent(entry, ("agents", i), faults) for i, entry in enumerate(data)]
-    return []
+        return []
+    grouped = [isinstance(entry, dict) and "group" in entry for entry in data]
+    if count is not None and not any(group and entry.get("count") is None for group, entry in zip(grouped, data, strict=True)):
+        faults.add(("count",), "count is of groups that have none of their own, but there are none", offset=AT_KEY)
+    return [
+        _group(entry, count, ("agents", i), faults) if group else _agent(entry, ("agents", i), faults)
+        for i, (entry, group) in enumerate(zip(data, grouped, strict=True))
+    ]
 
 
 def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
@@ -143,16 +153,42 @@ def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
         faults.add((*path, "id"), "id is missing; every agent needs one, such as a1", where)
     name = data.get("id", "")
     where = f"agent {name!r}" if isinstance(name, str) and name.strip() else where
-    constraints = data.get("constraints", [])
-    if not isinstance(constraints, list):
-        faults.add((*path, "constraints"), f"constraints is {shown(constraints)}, but must be a list of mappings", where)
-        constraints = []
-    made = [_constraint(item, (*path, "constraints", k), where, faults) for k, item in enumerate(constraints)]
+    made = [_constraint(item, at, where, faults) for at, item in _constraints(data, path, where, faults)]
     return Agent(name, made, data.get("start"))
 
 
-def _constraint(data: Any, path: Path, owner: str, faults: _Faults) -> Any:
-    """The constraint, or constraints; an empty list if the faults leave nothing to check."""
+def _group(data: dict[str, Any], count: Any, path: Path, faults: _Faults) -> Group:
+    name = data["group"]
+    where = f"group {name!r}" if isinstance(name, str) and name.strip() else f"agents[{path[-1]}]"
+    data = faults.keys(path, data, GROUP_KEYS, where)
+    if "count" not in data and count is None:
+        faults.add((*path, "count"), "count is missing; it tells how many agents the group stands for", where)
+    elif "count" not in data and not (type(count) is int and 1 <= count <= MOST):
+        faults.add(("count",), f"count is {shown(count)}, but must be a whole number from 1 to {MOST}")
+        count = 1
+    made = [_each(item, at, where, faults) for at, item in _constraints(data, path, where, faults)]
+    given = {key: data[key] for key in ("shape", "spacing", "scatter", "seed") if key in data}
+    return Group(name, data.get("count", count), made, **given)
+
+
+def _each(data: Any, path: Path, where: str, faults: _Faults) -> Each:
+    """A constraint of a group, with what it says of the member that has it."""
+    if not isinstance(data, dict):
+        return Each(_constraint(data, path, where, faults))
+    keys = MEMBER_KEYS if data.get("kind") == "expr" else MEMBER_KEYS[:1]
+    return Each(_constraint(data, path, where, faults, keys), data.get("of"), data.get("agent") if "agent" in keys else None)
+
+
+def _constraints(data: dict[str, Any], path: Path, where: str, faults: _Faults) -> list[tuple[Path, Any]]:
+    constraints = data.get("constraints", [])
+    if not isinstance(constraints, list):
+        faults.add((*path, "constraints"), f"constraints is {shown(constraints)}, but must be a list of mappings", where)
+        return []
+    return [((*path, "constraints", k), item) for k, item in enumerate(constraints)]
+
+
+def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tuple[str, ...] | None = None) -> Any:
+    """The constraint, or constraints; an empty list if the faults leave nothing to check. `besides`: keys not meant for it, in a group."""
     where = f"{owner}, constraint {int(path[-1]) + 1}"
     if not isinstance(data, dict):
         faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{kind: within, center: [2, 0], radius: 1}}", where)
@@ -167,12 +203,13 @@ def _constraint(data: Any, path: Path, owner: str, faults: _Faults) -> Any:
     name = data.get("name")
     where = f"{owner}, constraint {name if isinstance(name, str) else kind!r}"
     keys = _keys(kind)
-    data = faults.keys(path, data, ("kind", *keys), where)
+    data = faults.keys(path, data, ("kind", *keys, *(besides or ())), where)
     needed = [key for key, parameter in keys.items() if parameter.default is parameter.empty]
     # What is needed and missing gets a stand-in. The team's complaint about it is dropped: its place has a fault already.
     given: dict[str, Any] = dict.fromkeys(needed, "")
     for key, parameter in keys.items():
-        if key in data and "str" in str(parameter.annotation) and not isinstance(data[key], str):
+        text = besides is None if key == "agent" else "str" in str(parameter.annotation)
+        if key in data and text and not isinstance(data[key], str):
             faults.add((*path, key), f"{key} is {shown(data[key])}, but must be text; put numbers in quotes", where)
         elif key in data:
             given[key] = data[key]

@@ -5,6 +5,7 @@ YAML 1.2 contains JSON, so short values are written in its style; the layout is 
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import re
@@ -15,13 +16,18 @@ import numpy as np
 
 from consat.constraints import KINDS, OWNER, Constraint, box
 from consat.errors import Fault, InvalidTeam
+from consat.family import Family
+from consat.groups import Each, Group
 from consat.scenario.document import resolve
-from consat.scenario.schema import SETTINGS, VERSION
+from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
-from consat.team import TOPOLOGIES, Family, Team, topology
+from consat.team import TOPOLOGIES, Team, topology
 
 WIDTH: Final = 110
 """Lists and mappings up to this many characters stand on one line."""
+
+MOST_WRITTEN: Final = 10_000
+"""Up to so many agents are written one by one."""
 
 _WORDS = re.compile(r"[A-Za-z][\w-]*( [\w-]+)*", re.ASCII)
 _UNPRINTED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
@@ -38,26 +44,104 @@ def dump(team: Team, settings: Settings | None = None, name: str = "team") -> st
     Raises:
         InvalidTeam: names the constraints that are Python functions: no file can hold them.
     """
-    constraints: dict[int, dict[str, Any]] = {}
-    for family in team.families:
-        constraints.update(zip(map(int, family.number), _constraints(team, family), strict=True))
-    owned: list[list[dict[str, Any]]] = [[] for _ in team.ids]
+    grouped = team.members is not None and any(isinstance(member, Group) for member in team.members)
+    if not grouped and team.count > MOST_WRITTEN:
+        message = f"there are {team.count} agents, but at most {MOST_WRITTEN} are written one by one; make the team of consat.Group"
+        raise InvalidTeam([Fault(("agents",), message, "agents")])
+    singles = _agents(team)
+    if grouped:
+        counts = {member.count for member in team.members or () if isinstance(member, Group)}
+        shared = len(counts) == 1
+        agents = [_group(each, k, shared) if isinstance(each, Group) else next(singles) for k, each in enumerate(team.members or ())]
+        count = {"count": counts.pop()} if shared else {}
+    else:
+        agents, count = list(singles), {}
+    chosen = (settings or Settings()).model_dump(mode="json", by_alias=True, exclude_defaults=True, include=set(SETTINGS))
+    head = {"consat": VERSION, "name": name, "dimension": team.dimension} | count
+    return write(head | {"agents": agents, "communication": _communication(team)} | chosen)
+
+
+def _agents(team: Team) -> Iterator[dict[str, Any]]:
+    """The agents that are written one by one."""
+    grouped = np.zeros(team.count, dtype=bool)
+    first = 0
+    for member in team.members or ():
+        if isinstance(member, Group):
+            grouped[first : first + member.count] = True
+        first += member.count if isinstance(member, Group) else 1
+    alone = np.flatnonzero(~grouped)
+    owned: dict[int, dict[int, dict[str, Any]]] = {i: {} for i in alone.tolist()}
     faults = []
-    for number, owner in enumerate(team.owner):
-        if "kind" not in constraints[number]:
-            message = "it is a Python function, which no file can hold; use a library constraint or consat.expr"
-            path = ("agents", int(owner), "constraints", len(owned[owner]))
-            faults.append(Fault(path, message, f"agent {team.ids[owner]!r}, constraint {team.names[number]!r}"))
-        owned[owner].append(constraints[number])
+    for family in team.families:
+        chosen = np.flatnonzero(~grouped[family.owner])
+        for k, entry in zip(chosen.tolist(), _constraints(team, family, chosen), strict=True):
+            owned[int(family.owner[k])][int(family.number[k])] = entry
+    for owner, constraints in owned.items():
+        for place, number in enumerate(sorted(constraints)):
+            if "kind" not in constraints[number]:
+                message = "it is a Python function, which no file can hold; use a library constraint or consat.expr"
+                path = ("agents", owner, "constraints", place)
+                faults.append(Fault(path, message, f"agent {team.ids[owner]!r}, constraint {team.names[number]!r}"))
     if faults:
         raise InvalidTeam(faults)
-    agents = [
-        {"id": agent} | ({} if np.isnan(start).any() else {"start": start.tolist()}) | ({"constraints": own} if own else {})
-        for agent, start, own in zip(team.ids, team.starts, owned, strict=True)
-    ]
-    chosen = (settings or Settings()).model_dump(mode="json", by_alias=True, exclude_defaults=True, include=set(SETTINGS))
-    head = {"consat": VERSION, "name": name, "dimension": team.dimension}
-    return write(head | {"agents": agents, "communication": _communication(team)} | chosen)
+    for i, constraints in owned.items():
+        start, own = team.starts[i], [constraints[number] for number in sorted(constraints)]
+        yield {"id": team.ids[i]} | ({} if np.isnan(start).any() else {"start": start.tolist()}) | ({"constraints": own} if own else {})
+
+
+def _group(group: Group, place: int, same_count: bool) -> dict[str, Any]:
+    """The entry of a group.
+
+    Raises:
+        InvalidTeam: it has values of its own for each member.
+    """
+    path = ("agents", place)
+    where = f"group {group.name!r}"
+    if group.start is not None:
+        raise InvalidTeam([Fault((*path, "start"), "no file can hold a start for each member of a group; use scatter", where)])
+    given = {field.name: getattr(group, field.name) for field in dataclasses.fields(Group) if field.name in GROUP_KEYS}
+    kept = {
+        key: value
+        for key, value in given.items()
+        if key != "constraints" and value != _GROUP_DEFAULTS.get(key) and not (key == "count" and same_count)
+    }
+    constraints = []
+    for k, item in enumerate(group.constraints):
+        outer = item if isinstance(item, Each) else Each(item)
+        for constraint in outer.constraint if isinstance(outer.constraint, list | tuple) else [outer.constraint]:
+            entry = _each(constraint, outer)
+            if entry is None:
+                message = "no file can hold a Python function, or a value for each member; use a library constraint or consat.expr"
+                raise InvalidTeam([Fault((*path, "constraints", k), message, where)])
+            constraints.append(entry)
+    return {"group": group.name} | kept | ({"constraints": constraints} if constraints else {})
+
+
+def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
+    """The entry of a group's constraint; None if no file can hold it."""
+    values = {key: parameter.value for key, parameter in constraint.parameters.items()}
+    arrays = [outer.of, outer.agent, *constraint.reads, *(values.values() if constraint.psi not in _SIDES else ())]
+    if any(isinstance(value, np.ndarray) for value in arrays):
+        return None
+    if constraint.source is not None:
+        entry: dict[str, Any] = {"kind": "expr", "psi": constraint.source} | ({} if outer.agent is None else {"agent": outer.agent})
+    elif constraint.psi in _SIDES:
+        entry = _side(constraint.psi, {key: np.asarray(value, dtype=float) for key, value in values.items()})
+    elif constraint.psi in _KIND_OF:
+        entry = {"kind": _KIND_OF[constraint.psi]} | dict.fromkeys(["agent"] * (len(constraint.reads) - 1), constraint.reads[-1]) | values
+    else:
+        return None
+    named = {} if constraint.name is None else {"name": constraint.name}
+    weight = {} if constraint.weight == 1 else {"weight": float(constraint.weight)}
+    plain = {key: list(value) if isinstance(value, tuple) else value for key, value in (entry | named | weight).items()}
+    return plain | ({} if outer.of is None else {"of": outer.of})
+
+
+def _side(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The side of a box, as the half-space it is."""
+    sign, bound = _SIDES[psi]
+    normal = sign * parameters["axis"]
+    return {"kind": "halfspace", "normal": normal.tolist(), "offset": float(normal @ parameters[bound])}
 
 
 def write(data: Mapping[str, Any]) -> str:
@@ -65,18 +149,16 @@ def write(data: Mapping[str, Any]) -> str:
     return "\n".join(_lines(data)) + "\n"
 
 
-def _constraints(team: Team, family: Family) -> Iterator[dict[str, Any]]:
-    """The entries of a family, in its order; without ``kind`` if no file can hold them."""
-    for k, number in enumerate(family.number):
+def _constraints(team: Team, family: Family, chosen: np.ndarray) -> Iterator[dict[str, Any]]:
+    """The entries of these members of a family; without ``kind`` if no file can hold them."""
+    for k, number in zip(chosen.tolist(), family.number[chosen].tolist(), strict=True):
         parameters = {key: values[k].tolist() for key, values in family.parameters.items()}
         reads = [team.ids[i] for i in family.agents[k]]
         entry: dict[str, Any] = {}
         if family.sources is not None:
             entry = {"kind": "expr", "psi": family.sources[k]}
         elif family.psi in _SIDES:
-            sign, bound = _SIDES[family.psi]
-            normal = sign * family.parameters["axis"][k]
-            entry = {"kind": "halfspace", "normal": normal.tolist(), "offset": float(normal @ family.parameters[bound][k])}
+            entry = _side(family.psi, {key: values[k] for key, values in family.parameters.items()})
         elif family.psi in _KIND_OF:
             entry = {"kind": _KIND_OF[family.psi]} | ({"agent": reads[1]} if len(reads) > 1 else {}) | parameters
         others = [agent for agent, i in zip(reads, family.agents[k], strict=True) if i != family.owner[k]]
@@ -98,14 +180,19 @@ def _kinds() -> Iterator[tuple[Callable[..., Any], str]]:
 
 
 _KIND_OF: Final = dict(_kinds())
+_GROUP_DEFAULTS: Final = {field.name: field.default for field in dataclasses.fields(Group)}
 _SIDES: Final = {side.psi: (-1.0, "low") if "low" in side.parameters else (1.0, "high") for side in box([0], [1])}
 """Of the sides of a box: the sign of their normal, and the parameter that bounds them."""
 
 
 def _communication(team: Team) -> dict[str, Any]:
     for graph in ("task", *TOPOLOGIES):
-        if len(team.links) and np.array_equal(topology(graph, team.count, team.families), team.links):
+        whole = graph != "complete" or 2 * len(team.links) == team.count * (team.count - 1)
+        if len(team.links) and whole and np.array_equal(topology(graph, team.count, team.families), team.links):
             return {"graph": graph}
+    if len(team.links) > MOST_WRITTEN:
+        message = f"there are {len(team.links)} links, but at most {MOST_WRITTEN} are written; use one of {', '.join(TOPOLOGIES)}"
+        raise InvalidTeam([Fault(("communication", "links"), message, "communication")])
     return {"links": [[team.ids[i], team.ids[j]] for i, j in team.links]}
 
 
@@ -113,7 +200,8 @@ def _lines(value: Mapping[str, Any] | list[Any]) -> Iterator[str]:
     """The lines of a block: one an entry where the entry is short and holds no mapping, else its own block, indented."""
     entries = [(f"{_flow(key)}:", each) for key, each in value.items()] if isinstance(value, Mapping) else [("-", each) for each in value]
     for lead, each in entries:
-        if not isinstance(each, dict | list) or not any(map(_holds_mapping, each.values() if isinstance(each, dict) else each)):
+        parts = each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
+        if not any(_too_deep(part, lead) for part in parts):
             text = _flow(each)
             if len(text) <= WIDTH or not isinstance(each, dict | list):
                 yield f"{lead} {text}"
@@ -121,6 +209,11 @@ def _lines(value: Mapping[str, Any] | list[Any]) -> Iterator[str]:
         inner = _lines(each)
         yield f"- {next(inner)}" if lead == "-" else lead
         yield from (f"  {line}" for line in inner)
+
+
+def _too_deep(part: Any, lead: str) -> bool:
+    """Whether what holds this part needs a block of its own. An entry of a list may hold a mapping, if that is flat."""
+    return any(map(_holds_mapping, part.values())) if isinstance(part, dict) and lead == "-" else _holds_mapping(part)
 
 
 def _holds_mapping(value: Any) -> bool:

@@ -1,27 +1,29 @@
-"""Protocols in rounds: everybody speaks, the messages travel (or don't), everybody hears."""
+"""Protocols in rounds: the outer loop, what is recorded of it, and when it ends."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat import prox
 from consat.estimates import Estimates
-from consat.graphs import hops
-from consat.numerics import CompileClock, Groups, float64, quick_compilation
-from consat.objective import Nu, Objective
-from consat.protocols import Rounds, agreement
+from consat.numerics import CompileClock, float64, quick_compilation
+from consat.objective import Nu
+from consat.protocols import Rounds
 from consat.scale import Scale
 from consat.simulate import Stop
+from consat.simulate.checkpoint import Checkpoint, fingerprint
+from consat.simulate.interruption import heeded
+from consat.simulate.kernel import Body, Now, Seen, Weather, World, begin, one_round, see, world_of
+from consat.simulate.recording import Choice, Memory, Rows, Sink, told, velocities
 from consat.team import Team
-from consat.trace import Ending, Trace, satisfied_from
+from consat.trace import Ending, Trace
 
 HOLD = 10
 """How many rounds on end every margin must stay positive before a team counts as satisfied."""
@@ -29,254 +31,272 @@ PATIENCE = 2000
 """How many rounds a team may take when nobody says."""
 CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
+NEVER = 2**62
+"""More rounds than there are."""
 SETTLED = 1e-5
-"""A team has settled when over `HOLD` rounds no position moved by more than this fraction of the team's unit of length, …"""
+"""A team has settled when over a chunk no position moved by more than this fraction of the team's unit of length, …"""
 SETTLED_ALL_THE_SAME = 1e-7
 """… or than this, where a certificate should say when it is `enough`."""
-TOLERANCE = 1e-9
-"""Of every local step, relative."""
-MOST_NUMBERS = 1000
-"""Estimates are recorded by default while there are at most this many numbers."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Ends:
-    """Both ends of every link of every copy: `consat.protocols.Links` of all agents at once.
+class Kept(NamedTuple):
+    """What is recorded of a round, or with a leading axis of several.
 
     Attributes:
-        row: (E,) the copy at this end.
-        other: (E,) the index of the same link's other end.
-        groups: groups the ends by copy.
-        degree: (C,).
-        metropolis: (E,).
+        position: (R, d).
+        agent_margin: (R,).
+        estimate: (E, d), of no copies where none are recorded.
     """
-
-    row: Array
-    other: Array
-    groups: Groups
-    degree: Array
-    metropolis: Array
-
-    @classmethod
-    def of(cls, copies: Estimates) -> Ends:
-        receiver, sender = copies.edges.T.astype(np.int64)
-        other = np.searchsorted(receiver * copies.count + sender, sender * copies.count + receiver)
-        degree = np.bincount(receiver, minlength=copies.count)
-        metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
-        return cls(
-            jnp.asarray(receiver, dtype=jnp.int32),
-            jnp.asarray(other, dtype=jnp.int32),
-            Groups.of(receiver, copies.count),
-            jnp.asarray(degree, dtype=float),
-            jnp.asarray(metropolis),
-        )
-
-    def at(self, rows: Array) -> Array:
-        return self.groups.spread(rows)
-
-    def sum(self, links: Array) -> Array:
-        return self.groups.sum(links)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Everyone:
-    """`consat.protocols.Solver`, for all agents at once.
-
-    Attributes:
-        links: all ends.
-        length: the team's unit of length.
-        center: (d,) the team's middle.
-        reach: how far around it the team's places are.
-        batches: the agents by shape.
-        nu: the smoothing.
-        local: every agent's objective over its copies.
-        holder: (C,) who holds each copy.
-        talkers: groups the ends by agent.
-        agents: N.
-        hops: see `consat.graphs.hops`.
-        convex: whether every ψ is known to be concave.
-    """
-
-    links: Ends
-    length: Array
-    center: Array
-    reach: Array
-    batches: tuple[prox.Bucket, ...]
-    nu: Nu
-    local: Objective
-    holder: Array
-    talkers: Groups
-    agents: int = field(metadata={"static": True})
-    hops: int = field(metadata={"static": True})
-    convex: bool = field(metadata={"static": True})
-
-    def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        return prox.recall(self.batches, self.agents, self.nu, x, kappa)
-
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, prox.Memory, Array]:
-        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
-
-    def nearby(self, x: Array) -> Array:
-        away = (x - self.center[None, :]) / self.reach
-        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
-        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
-        return jnp.where(idle[:, None], x, self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far))
-
-    def margin(self, x: Array) -> Array:
-        return self.local.agent_margins(x)
-
-    def to_rows(self, numbers: Array) -> Array:
-        return numbers[self.holder]
-
-    def least(self, numbers: Array) -> Array:
-        return -self.talkers.max(-numbers)
-
-
-@dataclass(frozen=True)
-class Weather:
-    """What goes wrong on the way, seeded.
-
-    Attributes:
-        loss: probability that a message between two agents is lost, each direction by itself.
-        sleep: probability that an agent skips a round: it computes and sends nothing, but hears.
-        seed: of the draws.
-    """
-
-    loss: float = 0.0
-    sleep: float = 0.0
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class Body:
-    """A body cannot jump: p ← p + clip(x − p) to at most speed/rate a round.
-
-    Attributes:
-        rate: rounds a second, Hz.
-        speed: the most that a body moves, length/s.
-    """
-
-    rate: float
-    speed: float = np.inf
-
-
-class Seen(NamedTuple):
-    """What an observer of the whole team sees after each round; leading axis T."""
 
     position: Any
-    margin: Any
-    smooth_margin: Any
     agent_margin: Any
     estimate: Any
+
+
+class Chunk(NamedTuple):
+    """What is seen of up to `CHUNK` rounds.
+
+    Attributes:
+        done: how many.
+        margin: (CHUNK,) β̄ after each.
+        smooth_margin: (CHUNK,).
+        known: (CHUNK,) whether everybody knew that all were satisfied.
+        messages: (CHUNK,) sent.
+        floats: (CHUNK,) sent.
+        drift: how far any position was, on any axis, from where it was before; not finite if a position is not.
+        kept: of every so manieth round, with a leading axis; what stands beyond these means nothing.
+    """
+
+    done: Any
+    margin: Any
+    smooth_margin: Any
     known: Any
     messages: Any
     floats: Any
+    drift: Any
+    kept: Kept
+
+
+class Engine(Protocol):
+    """Who carries out the rounds: this process, or several."""
+
+    def start(self) -> tuple[Any, Chunk]:
+        """The state before the first round, and what is seen of it."""
+        ...
+
+    def advance(self, state: Any, number: int, count: int, streak: int, every: int) -> tuple[Any, Chunk]:
+        """Some rounds.
+
+        Args:
+            state: given up.
+            number: of the first of them.
+            count: how many.
+            streak: for how many rounds every margin has been positive; the rounds end when it reaches `HOLD`, if that ends the run.
+            every: each how manieth round to keep.
+        """
+        ...
+
+    def positions(self, state: Any) -> np.ndarray:
+        """(N, d) everyone's positions."""
+        ...
+
+    def look(self, state: Any) -> Kept:
+        """What is recorded of the state as it is."""
+        ...
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class _World:
-    """Everything a round needs that does not change.
+class _Chosen:
+    """Who is recorded.
 
     Attributes:
-        everyone: the agents.
-        observer: of their true positions.
-        own: (N,) rows of own positions.
-        talker: (E,) who speaks at each end.
-        pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
-        reach: most that a body moves in a round.
-        loss: see `Weather`.
-        sleep: see `Weather`.
-        pairs: how many directed pairs.
-        record: whether to keep the estimates.
-        rough: whether messages can be lost or agents sleep.
+        agents: (R,), or None for all in order.
+        copies: (E,).
     """
 
-    everyone: Everyone
-    observer: Objective
-    own: Array
-    talker: Array
-    pair: Array
-    reach: Array
-    loss: Array
-    sleep: Array
-    pairs: int = field(metadata={"static": True})
-    record: bool = field(metadata={"static": True})
-    rough: bool = field(metadata={"static": True})
+    agents: Array | None
+    copies: Array
+
+    @classmethod
+    def of(cls, choice: Choice) -> _Chosen:
+        agents = None if choice.everyone else jnp.asarray(choice.agents)
+        return cls(agents, jnp.asarray(np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)))
+
+    def of_seen(self, seen: Seen) -> Kept:
+        position, margin = (values if self.agents is None else values[self.agents] for values in (seen.position, seen.agent_margin))
+        return Kept(position, margin, seen.estimate[self.copies])
 
 
-class _Now(NamedTuple):
-    state: Any
-    ages: agreement.Ages
-    body: Array
-    key: Array
+class _Loop(NamedTuple):
+    done: Array
+    now: Now
+    streak: Array
+    places: Array
+    chunk: Chunk
 
 
-def _round(protocol: Rounds, world: _World, now: _Now, round_: Array) -> tuple[_Now, Seen]:
-    everyone, ends = world.everyone, world.everyone.links
-    spoken, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
-    ages, told = agreement.speak(now.ages, spoken.x, everyone)
-    arrived = jnp.ones(len(ends.row), dtype=bool)
-    key, sent, copies_sent = now.key, jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
-    if world.rough:
-        key, draw_loss, draw_sleep = jax.random.split(now.key, 3)
-        awake = jax.random.uniform(draw_sleep, (everyone.agents,)) >= world.sleep
-        spoken = _where_awake(protocol.per, world, awake, spoken, now.state)
-        ages = _where_awake({"age": "agent", "heard": "link"}, world, awake, ages, now.ages)
-        goes = awake[world.talker]
-        sent = jnp.sum(jax.ops.segment_max(goes.astype(int), world.pair, world.pairs))
-        copies_sent = jnp.sum(goes)
-        arrived = (goes & (jax.random.uniform(draw_loss, (world.pairs,)) >= world.loss)[world.pair])[ends.other]
-    state = protocol.hear(spoken, jax.tree.map(lambda leaf: leaf[ends.other], message), arrived, everyone)
-    ages = agreement.hear(ages, told[ends.other], arrived)
-    target = state.x[world.own]
-    away = target - now.body
-    distance = jnp.linalg.norm(away, axis=1, keepdims=True)
-    body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
-    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
-    known = jnp.all(agreement.known(ages, everyone) > 0)
-    return _Now(state, ages, body, key), _see(world, state.x, body, known, sent, floats)
+def _start(protocol: Rounds, world: World, chosen: _Chosen, first: Array, key: Array) -> tuple[Now, Chunk]:
+    now, seen = begin(protocol, world, first, key)
+    kept = Kept(*(jnp.expand_dims(leaf, 0) for leaf in chosen.of_seen(seen)))
+    scalars = {name: getattr(seen, name)[None] for name in SCALARS}
+    return now, Chunk(jnp.asarray(1), **scalars, drift=jnp.max(jnp.abs(now.body), initial=0.0), kept=kept)
 
 
-def _see(world: _World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
-    margins = world.observer.agent_margins(body)
-    smooth = world.observer.smooth_margin(body, world.everyone.nu)
-    return Seen(body, jnp.min(margins), smooth, margins, x if world.record else x[:0], known, messages, floats)
+SCALARS = ("margin", "smooth_margin", "known", "messages", "floats")
 
 
-def _where_awake(per: Mapping[str, Any], world: _World, awake: Array, new: Any, old: Any) -> Any:
-    """The new state of those awake, the old one of those asleep."""
-    masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
+class _Ask(NamedTuple):
+    """Of the arguments of `Engine.advance` the numbers, and `hold`: how many satisfied rounds on end end the run."""
 
-    def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
-        if isinstance(per, str):
-            return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
-        return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
-
-    return choose(per, new, old)
+    number: Array
+    rounds: Array
+    streak: Array
+    every: Array
+    hold: Array
 
 
-def _rounds(protocol: Rounds, world: _World, now: _Now, numbers: Array) -> tuple[_Now, Seen]:
-    return jax.lax.scan(lambda at, number: _round(protocol, world, at, number), now, numbers)
+def _advance(protocol: Rounds, world: World, chosen: _Chosen, capacity: int, now: Now, ask: _Ask) -> tuple[Now, Chunk]:
+    """Rounds until there are so many, or enough on end are satisfied; what is kept of them goes into buffers of `capacity`."""
+    anchor = now.body
+    real, whole = now.body.dtype, jnp.asarray(0).dtype
+    d = now.body.shape[1]
+    recorded = len(now.body) if chosen.agents is None else len(chosen.agents)
+    empty = Chunk(
+        done=jnp.zeros_like(ask.rounds),
+        margin=jnp.zeros(CHUNK, real),
+        smooth_margin=jnp.zeros(CHUNK, real),
+        known=jnp.zeros(CHUNK, bool),
+        messages=jnp.zeros(CHUNK, whole),
+        floats=jnp.zeros(CHUNK, whole),
+        drift=jnp.zeros((), real),
+        kept=Kept(
+            jnp.zeros((capacity, recorded, d), real),
+            jnp.zeros((capacity, recorded), real),
+            jnp.zeros((capacity, len(chosen.copies), d), real),
+        ),
+    )
+
+    def step(at: _Loop) -> _Loop:
+        now, seen, keep = _one(protocol, world, chosen, at.now, ask.number + at.done)
+        chunk = at.chunk
+        drift = jnp.maximum(chunk.drift, jnp.max(jnp.abs(now.body - anchor), initial=0.0))
+        numbers = {
+            name: jax.lax.dynamic_update_index_in_dim(getattr(chunk, name), value, at.done, 0)
+            for name, value in zip(SCALARS, seen, strict=True)
+        }
+        # what is not to be kept is overwritten by the next
+        kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
+        places = jnp.where((ask.number + at.done + 1) % ask.every == 0, at.places + 1, at.places)
+        streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
+        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, drift=drift, kept=kept))
+
+    def goes_on(at: _Loop) -> Array:
+        return (at.done < ask.rounds) & (at.streak < ask.hold)
+
+    end = jax.lax.while_loop(goes_on, step, _Loop(empty.done, now, ask.streak, empty.done, empty))
+    return end.now, end.chunk
 
 
-def _begin(protocol: Rounds, world: _World, first: Array, key: Array) -> tuple[_Now, Seen]:
-    start = first[world.own]
-    now = _Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key)
-    return now, jax.tree.map(lambda leaf: leaf[None], _see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0)))
+def _one(protocol: Rounds, world: World, chosen: _Chosen, now: Now, number: Array) -> tuple[Now, tuple[Array, ...], Kept]:
+    now, seen = one_round(protocol, world, now, number.astype(float))
+    return now, tuple(getattr(seen, name) for name in SCALARS), chosen.of_seen(seen)
+
+
+def _look(world: World, chosen: _Chosen, now: Now) -> Kept:
+    nothing = jnp.asarray(0)
+    return chosen.of_seen(see(world, now.state.x, now.body, nothing, nothing, nothing))
 
 
 @functools.cache
-def _compiled() -> tuple[Callable[..., tuple[_Now, Seen]], Callable[..., tuple[_Now, Seen]]]:
-    begin, rounds = (
-        jax.jit(function, static_argnames=("protocol",), compiler_options=quick_compilation()) for function in (_begin, _rounds)
+def _compiled() -> tuple[Callable[..., tuple[Now, Chunk]], Callable[..., tuple[Now, Chunk]], Callable[..., Kept]]:
+    options = quick_compilation()
+    return (
+        jax.jit(_start, static_argnames=("protocol",), compiler_options=options),
+        jax.jit(_advance, static_argnames=("protocol", "capacity"), donate_argnames=("now",), compiler_options=options),
+        jax.jit(_look, compiler_options=options),
     )
-    return begin, rounds
+
+
+class OneProcess:
+    """All rounds in this process.
+
+    Args:
+        protocol: what the agents do.
+        world: what does not change.
+        first: (C, d) first estimates.
+        seed: of what goes wrong.
+        choice: what is recorded.
+        hold: how many satisfied rounds on end are the end; None if nothing of the kind is.
+    """
+
+    def __init__(self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None) -> None:
+        self._first, self._seed, self._hold = first, seed, hold
+        self._protocol, self._world, self._chosen = protocol, world, _Chosen.of(choice)
+        self._capacity = -(-CHUNK // choice.every) + 1
+
+    def start(self) -> tuple[Now, Chunk]:
+        first, key = jnp.asarray(self._first), jax.random.key(self._seed)
+        return _compiled()[0](self._protocol, self._world, self._chosen, first, key)
+
+    def advance(self, state: Now, number: int, count: int, streak: int, every: int) -> tuple[Now, Chunk]:
+        hold = NEVER if self._hold is None else self._hold
+        ask = _Ask(*(jnp.asarray(value) for value in (number, count, streak, every, hold)))
+        return _compiled()[1](self._protocol, self._world, self._chosen, self._capacity, state, ask)
+
+    def positions(self, state: Now) -> np.ndarray:
+        return np.array(state.body)
+
+    def look(self, state: Now) -> Kept:
+        kept = _compiled()[2](self._world, self._chosen, state)
+        return Kept(*map(np.array, kept))
+
+
+@dataclass
+class Tally:
+    """What is counted as the rounds go by; plain numbers, which a checkpoint holds.
+
+    Attributes:
+        done: rounds.
+        streak: for how many rounds every margin has been positive.
+        last_bad: the last round whose margin was ≤ 0, or −1.
+        last_unknown: the last round after which not everybody knew, or −1.
+        messages: sent.
+        floats: sent.
+        margin: the last.
+        smooth_margin: the last.
+        drift: of the last chunk.
+        recorded: steps in the record.
+        every: each how manieth round is recorded.
+    """
+
+    done: int = -1
+    streak: int = 0
+    last_bad: int = -1
+    last_unknown: int = -1
+    messages: int = 0
+    floats: int = 0
+    margin: float = np.nan
+    smooth_margin: float = np.nan
+    drift: float = np.inf
+    recorded: int = 0
+    every: int = 1
+
+    def add(self, chunk: Chunk) -> np.ndarray:
+        """Count some rounds; gives their numbers."""
+        count = int(chunk.done)
+        numbers = np.arange(self.done + 1, self.done + 1 + count)
+        margin, known = np.asarray(chunk.margin)[:count], np.asarray(chunk.known)[:count]
+        bad, unknown = np.flatnonzero(~(margin > 0)), np.flatnonzero(~known)
+        self.streak = self.streak + count if not len(bad) else count - 1 - int(bad[-1])
+        self.last_bad = int(numbers[bad[-1]]) if len(bad) else self.last_bad
+        self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
+        self.messages += int(np.sum(np.asarray(chunk.messages)[:count]))
+        self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
+        self.done += count
+        self.margin, self.smooth_margin = float(margin[-1]), float(chunk.smooth_margin[count - 1])
+        self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
+        return numbers
 
 
 @float64
@@ -294,6 +314,9 @@ def simulate_rounds(
     weather: Weather | None = None,
     body: Body | None = None,
     record: bool | None = None,
+    choice: Choice | None = None,
+    sink: Sink | None = None,
+    checkpoint: Checkpoint | None = None,
     hopeless: Callable[[np.ndarray], bool] = lambda _: False,
     enough: Callable[[np.ndarray], bool] | None = None,
     progress: Callable[[float, float], None] = lambda *_: None,
@@ -313,129 +336,161 @@ def simulate_rounds(
         weather: loss and sleep; none if None.
         body: how fast positions follow estimates; at once if None.
         record: whether to keep all estimates; if None, while they are few.
+        choice: what to record; if None, what the size of the team suggests.
+        sink: where to; in memory if None.
+        checkpoint: where to keep the state, and what to take up; nowhere and nothing if None.
         hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
         enough: says of (N, d) positions whether no formation is better by more than a tolerance.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     weather = weather or Weather()
-    end = PATIENCE if rounds is None else rounds
-    world = _world(team, copies, nu, size, convex=convex, weather=weather, body=body, record=record)
-    seen: list[Seen] = []
-    ending: Ending = "out of time"
-    done = 0
-    begin, go_on = _compiled()
-    with CompileClock() as clock:
-        now, looked = begin(protocol, world, jnp.asarray(first), jax.random.key(weather.seed))
-        seen.append(jax.tree.map(np.asarray, looked))
-        try:
-            while done < end:
-                count = min(CHUNK, end - done)
-                now, looked = go_on(protocol, world, now, jnp.arange(done, done + count, dtype=float))
-                seen.append(jax.tree.map(np.asarray, looked))
-                done += count
-                progress(done / end, float(seen[-1].margin[-1]))
-                settle = done >= protocol.earliest(world.everyone)
-                if (found := _ending(seen, stop, size.length, settle, hopeless, enough)) is not None:
-                    ending = found
-                    break
-        except KeyboardInterrupt:
-            ending = "interrupted"
-    whole = Seen(*(np.concatenate([getattr(part, name) for part in seen]) for name in Seen._fields))
-    if stop == "satisfied" and ending == "satisfied":
-        whole = Seen(*(leaf[: _satisfied_at(whole.margin) + 1] for leaf in whole))
-    return _trace(whole, world, copies, ending, body, clock.seconds)
-
-
-def _world(
-    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, record: bool | None
-) -> _World:
-    ends = Ends.of(copies)
-    everyone = Everyone(
-        links=ends,
-        length=jnp.asarray(size.length),
-        center=jnp.asarray(size.center),
-        reach=jnp.asarray(size.reach),
-        batches=prox.buckets(team, copies.rows, copies.count, convex),
-        nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
-        local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
-        holder=jnp.asarray(copies.holder),
-        talkers=Groups.of(copies.holder[copies.edges[:, 0]], team.count),
-        agents=team.count,
-        hops=hops(team.count, copies.links),
-        convex=convex,
-    )
-    talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
-    pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)
-    return _World(
-        everyone=everyone,
-        observer=Objective.at_positions(team),
-        own=jnp.asarray(copies.own),
-        talker=jnp.asarray(talker, dtype=jnp.int32),
-        pair=jnp.asarray(pair, dtype=jnp.int32),
-        reach=jnp.asarray(np.inf if body is None else body.speed / body.rate),
-        loss=jnp.asarray(weather.loss),
-        sleep=jnp.asarray(weather.sleep),
-        pairs=len(pairs),
-        record=copies.count * team.dimension <= MOST_NUMBERS if record is None else record,
-        rough=weather.loss > 0 or weather.sleep > 0,
-    )
-
-
-def _satisfied_at(margin: np.ndarray) -> int:
-    """The round at which every margin was positive for `HOLD` rounds on end, or −1."""
-    good = np.concatenate([[0], np.cumsum(margin > 0)])
-    whole = np.flatnonzero(good[HOLD:] - good[:-HOLD] == HOLD)
-    return int(whole[0]) + HOLD - 1 if len(whole) else -1
-
-
-def _for_good(known: np.ndarray) -> int | None:
-    """The round from which on everybody knew, or None."""
-    unknown = np.flatnonzero(~known)
-    since = int(unknown[-1]) + 1 if len(unknown) else 0
-    return since if since < len(known) else None
-
-
-def _ending(
-    seen: list[Seen], stop: Stop, length: float, settle: bool, hopeless: Callable[[np.ndarray], bool],
-    enough: Callable[[np.ndarray], bool] | None,
-) -> Ending | None:  # fmt: skip
-    last = seen[-1]
-    if not np.isfinite(last.position).all():
-        return "diverged"
-    if stop == "never":
-        return None
-    if stop == "satisfied" and _satisfied_at(np.concatenate([part.margin for part in seen[-3:]])) >= 0:
-        return "satisfied"
-    if stop == "converged" and enough is not None and enough(last.position[-1]):
-        return "settled"
-    position = np.concatenate([part.position for part in seen[-3:]])[-HOLD:]
+    world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body)
+    choice = choice or Choice.of(team, copies, estimates=record)
+    engine = OneProcess(protocol, world, first, weather.seed, choice, HOLD if stop == "satisfied" else None)
     still = SETTLED if enough is None else SETTLED_ALL_THE_SAME
-    settled = settle and len(position) == HOLD and np.abs(position - position[-1]).max(initial=0.0) <= still * length
-    return "settled" if settled and (stop == "converged" or hopeless(position[-1])) else None
+    rules = Rules(
+        end=PATIENCE if rounds is None else rounds, stop=stop, still=still * size.length, earliest=protocol.earliest(world.everyone),
+        hopeless=hopeless, enough=enough,
+    )  # fmt: skip
+    problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
+    return conduct(
+        engine,
+        rules,
+        copies,
+        choice,
+        sink=sink or Memory(choice.every),
+        checkpoint=checkpoint,
+        problem=problem,
+        body=body,
+        progress=progress,
+    )
 
 
-def _trace(seen: Seen, world: _World, copies: Estimates, ending: Ending, body: Body | None, seconds: dict[str, float]) -> Trace:
-    steps = np.arange(len(seen.margin))
+@dataclass(frozen=True)
+class Rules:
+    """When a run ends; see `simulate_rounds`.
+
+    Attributes:
+        end: rounds at most.
+        stop: when to end earlier.
+        still: a chunk in which no position moved farther is one in which the team stood still, length.
+        earliest: the round before which to stand still means nothing.
+        hopeless: see `simulate_rounds`.
+        enough: see `simulate_rounds`.
+    """
+
+    end: int
+    stop: Stop
+    still: float
+    earliest: int = 0
+    hopeless: Callable[[np.ndarray], bool] = lambda _: False
+    enough: Callable[[np.ndarray], bool] | None = None
+
+    def ending(self, tally: Tally, positions: Callable[[], np.ndarray]) -> Ending | None:
+        """Why the run should end now, or None."""
+        if np.isnan(tally.drift) or (tally.drift == np.inf and not np.isfinite(positions()).all()):
+            return "diverged"
+        if self.stop == "never":
+            return None
+        if self.stop == "satisfied" and tally.streak >= HOLD:
+            return "satisfied"
+        if self.stop == "converged" and self.enough is not None and self.enough(positions()):
+            return "settled"
+        settled = tally.done >= self.earliest and tally.drift <= self.still
+        return "settled" if settled and (self.stop == "converged" or self.hopeless(positions())) else None
+
+
+def conduct(
+    engine: Engine, rules: Rules, copies: Estimates, choice: Choice, *, sink: Sink, checkpoint: Checkpoint | None, problem: str,
+    body: Body | None, progress: Callable[[float, float], None],
+) -> Trace:  # fmt: skip
+    """The loop around the rounds.
+
+    Args:
+        engine: who carries them out.
+        rules: when they end.
+        copies: the layout of estimates.
+        choice: what is recorded.
+        sink: where to.
+        checkpoint: where the state is kept.
+        problem: its fingerprint.
+        body: see `simulate_rounds`.
+        progress: see `simulate_rounds`.
+    """
+    ending: Ending = "out of time"
+    tally = Tally(every=choice.every)
+    with CompileClock() as clock, heeded() as stopped:
+        state, chunk = engine.start()
+        taken = None if checkpoint is None else checkpoint.restore(state, problem)
+        if taken is None:
+            _record(sink, choice, tally, chunk)
+        else:
+            state, tally = taken[0], Tally(**taken[1])
+            sink.every = tally.every
+
+        def save() -> None:
+            if checkpoint is not None:
+                sink.flush()
+                checkpoint.write(state, tally.__dict__, problem)
+
+        while tally.done < rules.end:
+            count = min(CHUNK, rules.end - tally.done)
+            state, chunk = engine.advance(state, tally.done, count, tally.streak, sink.every)
+            _record(sink, choice, tally, chunk)
+            found = rules.ending(tally, functools.partial(engine.positions, state))
+            if found is None and (stopped() or not told(progress, tally.done / rules.end, tally.margin)):
+                found = "interrupted"
+            if found is not None:
+                ending = found
+                break
+            if checkpoint is not None and checkpoint.due():
+                save()
+        save()
+    if tally.done % sink.every:  # the last round is always recorded
+        kept = engine.look(state)
+        _append(
+            sink, choice, np.array([tally.done]), np.array([tally.margin]), np.array([tally.smooth_margin]), Kept(*(k[None] for k in kept))
+        )
+    rows = sink.close()
     dt = 1.0 if body is None else 1.0 / body.rate
-    velocity = np.diff(seen.position, axis=0, append=seen.position[-1:]) / dt
     return Trace(
         clock="round",
-        steps=steps,
-        position=seen.position,
-        velocity=velocity,
-        margin=seen.margin,
-        smooth_margin=seen.smooth_margin,
-        agent_margin=seen.agent_margin,
-        estimate=seen.estimate if world.record else None,
+        steps=rows.step,
+        position=rows.position,
+        velocity=velocities(rows.step, rows.position, dt),
+        margin=rows.margin,
+        smooth_margin=rows.smooth_margin,
+        agent_margin=rows.agent_margin,
+        estimate=rows.estimate,
         integral=None,
-        holder=copies.holder,
-        held=copies.position,
+        holder=copies.holder if choice.copies is None else copies.holder[choice.copies],
+        held=copies.position if choice.copies is None else copies.position[choice.copies],
         cluster=copies.cluster,
         ending=ending,
-        satisfied_from=satisfied_from(steps, seen.margin, interpolate=False),
-        messages=int(seen.messages.sum()),
-        floats_sent=int(seen.floats.sum()),
-        known_from=_for_good(seen.known),
-        seconds=seconds,
+        satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None,
+        messages=tally.messages,
+        floats_sent=tally.floats,
+        known_from=tally.last_unknown + 1 if tally.last_unknown < tally.done else None,
+        seconds=clock.seconds,
         period=None if body is None else dt,
+        recorded=None if choice.everyone else choice.agents,
+        final=engine.positions(state),
+        drift=tally.drift if tally.done >= CHUNK else np.inf,
+        file=sink.path,
     )
+
+
+def _record(sink: Sink, choice: Choice, tally: Tally, chunk: Chunk) -> None:
+    """Count some rounds, and keep of them what is wanted."""
+    every = sink.every
+    numbers = tally.add(chunk)
+    chosen = np.flatnonzero(numbers % every == 0)
+    kept = Kept(*(np.asarray(leaf)[: len(chosen)] for leaf in chunk.kept))
+    _append(sink, choice, numbers[chosen], np.asarray(chunk.margin)[chosen], np.asarray(chunk.smooth_margin)[chosen], kept)
+    tally.recorded += len(chosen)
+    tally.every = sink.every
+
+
+def _append(sink: Sink, choice: Choice, step: np.ndarray, margin: np.ndarray, smooth_margin: np.ndarray, kept: Kept) -> None:
+    estimate = None if choice.copies is None else kept.estimate
+    sink.append(Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None))

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ from consat.numerics import float64
 from consat.result import Result
 from consat.team import Team
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, which the colour-blind can tell apart, without the yellow, which nobody sees on white."""
 MARKERS = ("o", "s", "^", "D", "v", "<", ">")
@@ -37,6 +40,8 @@ DPI = 150
 BATCH = 8192
 FAR = 6.0
 """Paths that would make the view this many times wider are cut, so that the formation stays visible."""
+MOST_NUMBERS = 10_000_000
+"""Of a longer record some steps are drawn, evenly spread."""
 MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 1200, 12, 60
 
 
@@ -128,13 +133,27 @@ def view(paths: np.ndarray, x: np.ndarray, team: Team | None) -> tuple[np.ndarra
     return low - spare, high + spare, cut
 
 
-def formation(result: Result, axes: Any = None) -> Figure:
+def recorded(result: Result) -> xr.Dataset:
+    """What was recorded of a run; of a very long record some steps, evenly spread, and the last."""
+    data = result.data
+    clock = str(data["margin"].dims[0])
+    count, row = data.sizes[clock], sum(math.prod(data[name].shape[1:]) for name in data.data_vars if clock in data[name].dims)
+    most = max(2, MOST_NUMBERS // max(row, 1))
+    return data if count <= most else data.isel({clock: _sample(count, most)})
+
+
+def formation(result: Result, axes: Any = None) -> Figure | None:
     """Paths from start (open) to end (filled), and where each constraint holds for its owner, as the others stand in the end.
 
     Args:
         result: of a run.
         axes: what to draw on, 3-D axes for a team in space; if None, a new figure.
+
+    Returns:
+        None if nobody was recorded.
     """
+    if "position" not in result.data:
+        return None
     from consat.views.scene import Scene  # a still is the last moment of a film
 
     scene = Scene(result, axes)
@@ -145,7 +164,7 @@ def formation(result: Result, axes: Any = None) -> Figure:
 
 def margins(result: Result) -> Figure:
     """The margin β̄ and the smooth margin β, from when on every constraint holds, and between what the best margin is proven to lie."""
-    data, summary = result.data, result.summary
+    data, summary = recorded(result), result.summary
     figure, axes, clock = _chart(result, "margin of the team", "margin")
     axes.axhline(0.0, color="black", linewidth=0.8)
     for name, label, k in (("margin", r"margin $\barβ$", 0), ("smooth_margin", r"smooth margin $β$", 1)):
@@ -214,7 +233,7 @@ def integrals(result: Result) -> Figure | None:
 
 
 def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None:
-    data = result.data
+    data = recorded(result)
     if name not in data:
         return None
     ids, names = ([str(value) for value in data[key].values] for key in ("agent", "axis"))

@@ -18,7 +18,7 @@ from matplotlib.patheffects import withStroke
 
 from consat.result import Result
 from consat.team import Team
-from consat.views.figures import GREY, STYLES, colour, grid, marker, number, plain, regions, view
+from consat.views.figures import GREY, STYLES, colour, grid, marker, number, plain, recorded, regions, view
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 GRID = 241  # points along each side of the view at which ψ is evaluated
@@ -53,13 +53,14 @@ class Scene:
     """
 
     def __init__(self, result: Result, axes: Any = None) -> None:
-        data, team = result.data, result.team
+        data, team = recorded(result), None if "final_position" in result.data else result.team  # regions need everybody
         self.x, self._clock = data["position"].values, str(data["position"].dims[0])
         self.steps, self._margin, self._agent_margin = (data[name].values for name in (self._clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
         self.last = int(finite[-1]) if len(finite) else 0
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values if self._few]
+        self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
         self._team = team if self._few and team is not None and len(team.owner) else None
         self._links = team.links if team is not None and len(team.links) <= MOST_LINES else np.zeros((0, 2), dtype=int)
         self._line, self._space = self.x.shape[2] == 1, self.x.shape[2] == 3
@@ -147,7 +148,7 @@ class Scene:
             self.moving += self.axes.plot(*_joined(trail[-1][self._links]), color="0.75", linewidth=1 if self._few else 0.6, zorder=1.5)
         clock = f"{_between(self.steps, moment)[0]:.1f}".removesuffix(".0")
         time = f"t = {clock} s" if self._clock == "time" else f"round {self.steps[sample]:.0f}"
-        notes = ["starts out of view"] * self._cut + [f"the first two of {self.x.shape[2]} axes"] * (self.x.shape[2] > 3)
+        notes = [*self._sample, *["starts out of view"] * self._cut] + [f"the first two of {self.x.shape[2]} axes"] * (self.x.shape[2] > 3)
         margin = f", margin {number(self._margin[sample])}" if np.isfinite(self._margin[sample]) else ""
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 

@@ -1,0 +1,251 @@
+"""Constraints in bulk: families with stacked parameters, and ids and names that are made only when somebody asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """M constraints that share one function ψ, with stacked parameters; evaluated by one `jax.vmap`.
+
+    Attributes:
+        kind: the name errors and reports use.
+        psi: ``psi(*positions, **parameters) -> scalar``.
+        agents: (M, arity) whose positions ψ takes.
+        owner: (M,) whose constraint it is.
+        number: (M,) place in the team's order of constraints, which is by owner.
+        parameters: arrays with leading axis M.
+        weight: (M,) positive factors on ψ.
+        sources: (M,) the texts, if they were written as text expressions, else None.
+    """
+
+    kind: str
+    psi: Callable[..., Any]
+    agents: np.ndarray
+    owner: np.ndarray
+    number: np.ndarray
+    parameters: Mapping[str, np.ndarray]
+    weight: np.ndarray
+    sources: Sequence[str] | None = None
+
+    @property
+    def size(self) -> int:
+        return len(self.owner)
+
+    @property
+    def arity(self) -> int:
+        return int(self.agents.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Constraints on their way into a family; as there, but not yet numbered.
+
+    Attributes:
+        kind: see `Family`.
+        psi: likewise.
+        agents: likewise.
+        owner: likewise.
+        parameters: likewise.
+        weight: likewise.
+        names: (M,) what reports call them.
+        sources: likewise.
+        turn: (M,) where each was written among those of all parts that say; constraints of one owner keep that order. None: in the
+            order of the parts, after those.
+    """
+
+    kind: str
+    psi: Callable[..., Any]
+    agents: np.ndarray
+    owner: np.ndarray
+    parameters: Mapping[str, np.ndarray]
+    weight: np.ndarray
+    names: Sequence[str]
+    sources: Sequence[str] | None = None
+    turn: np.ndarray | None = None
+
+    @property
+    def family(self) -> tuple[Any, ...]:
+        """What constraints of one family have in common."""
+        shapes = tuple((key, value.shape[1:]) for key, value in sorted(self.parameters.items()))
+        return self.psi, self.agents.shape[1], shapes
+
+
+def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
+    """The families of all parts, the (M,) owners of the constraints in the team's order, which is by owner, and their names."""
+    parts = sorted(parts, key=lambda part: part.turn is None)
+    owner = np.concatenate([np.zeros(0, dtype=np.int32), *(part.owner for part in parts)])
+    order = _order(parts, owner)
+    number = np.arange(len(owner), dtype=np.int32)
+    if order is not None:
+        number[order] = number.copy()
+    names = Chosen(Joined([part.names for part in parts]), order)
+    stops = np.cumsum([0, *(len(part.owner) for part in parts)])
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for p, part in enumerate(parts):
+        alike.setdefault(part.family, []).append(p)
+    families = []
+    for members in alike.values():
+        group, first = [parts[p] for p in members], parts[members[0]]
+        texts = [part.sources for part in group if part.sources is not None]
+        families.append(
+            Family(
+                kind=first.kind,
+                psi=first.psi,
+                agents=_joined([part.agents for part in group]),
+                owner=_joined([part.owner for part in group]),
+                number=_joined([number[stops[p] : stops[p + 1]] for p in members]),
+                parameters={key: _joined([part.parameters[key] for part in group]) for key in first.parameters},
+                weight=_joined([part.weight for part in group]),
+                sources=Joined(texts) if len(texts) == len(group) else None,
+            )
+        )
+    return tuple(families), owner if order is None else owner[order], names
+
+
+def _order(parts: Sequence[Part], owner: np.ndarray) -> np.ndarray | None:
+    """(M,) the constraints by owner, those of one owner as they were written; None if they are in that order."""
+    turns = [part.turn for part in parts if part.turn is not None]
+    first = np.argsort(np.concatenate(turns)) if turns else np.zeros(0, dtype=np.intp)
+    order = np.concatenate([first, np.arange(len(first), len(owner))])
+    order = order[np.argsort(owner[order], kind="stable")].astype(np.int32)
+    return None if np.array_equal(order, np.arange(len(order))) else order
+
+
+def _joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def distinct(keys: np.ndarray) -> np.ndarray:
+    """The different ones among integers, sorted; for millions of them several times as fast as `numpy.unique`."""
+    rising = np.all(keys[1:] >= keys[:-1])
+    ordered = keys if rising else np.sort(keys)
+    new = np.ones(len(ordered), dtype=bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
+    return ordered if new.all() else ordered[new]
+
+
+class Texts(Sequence[str]):
+    """Texts that are made when asked for; compares equal to any sequence of the same ones."""
+
+    def text(self, index: int) -> str:
+        """The text at `index`, which is in range."""
+        raise NotImplementedError
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[str]: ...
+    def __getitem__(self, index: int | slice) -> str | Sequence[str]:
+        if isinstance(index, slice):
+            return tuple(self.text(i) for i in range(*index.indices(len(self))))
+        place = int(index) + (len(self) if index < 0 else 0)
+        if not 0 <= place < len(self):
+            raise IndexError(f"there are {len(self)} texts, but number {index} was asked for")
+        return self.text(place)
+
+    def __iter__(self) -> Iterator[str]:
+        return map(self.text, range(len(self)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        few = ", ".join(map(repr, self[:3]))
+        return f"<{len(self)} texts: {few}{', …' if len(self) > 3 else ''}>"
+
+
+class Joined(Texts):
+    """Several sequences one after the other."""
+
+    def __init__(self, parts: Iterable[Sequence[str]]) -> None:
+        self.parts = tuple(parts)
+        self.starts = np.cumsum([0, *map(len, self.parts)])
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def text(self, index: int) -> str:
+        part = int(np.searchsorted(self.starts, index, side="right")) - 1
+        return self.parts[part][index - int(self.starts[part])]
+
+    def __iter__(self) -> Iterator[str]:
+        for part in self.parts:
+            yield from part
+
+
+class Chosen(Texts):
+    """A sequence in another order; None keeps it."""
+
+    def __init__(self, of: Sequence[str], order: np.ndarray | None) -> None:
+        self.of, self.order = of, order
+
+    def __len__(self) -> int:
+        return len(self.of) if self.order is None else len(self.order)
+
+    def text(self, index: int) -> str:
+        return self.of[index if self.order is None else int(self.order[index])]
+
+
+class Repeated(Texts):
+    """One text so many times."""
+
+    def __init__(self, each: str, count: int) -> None:
+        self.each, self.size = each, count
+
+    def __len__(self) -> int:
+        return self.size
+
+    def text(self, index: int) -> str:
+        return self.each
+
+
+class Counted(Texts):
+    """A stem with a number from 1 on: a1, a2, …"""
+
+    def __init__(self, stem: str, count: int) -> None:
+        self.stem, self.size = stem, count
+
+    def __len__(self) -> int:
+        return self.size
+
+    def text(self, index: int) -> str:
+        return f"{self.stem}{index + 1}"
+
+    def find(self, text: object) -> int | None:
+        """The place of a text, if it is one of these."""
+        if not isinstance(text, str) or not text.startswith(self.stem):
+            return None
+        digits = text[len(self.stem) :]
+        whole = digits.isascii() and digits.isdigit() and digits[0] != "0" and len(digits) < 16
+        return int(digits) - 1 if whole and int(digits) <= self.size else None
+
+
+class Derived(Texts):
+    """Names made of a stem, the other agents read, and a number where they would repeat.
+
+    Args:
+        stem: what the user calls them, or their kind.
+        ids: of the team; None if the others have no place in the name.
+        others: (M, k) the other agents.
+        rank: (M,) how many of the same name its owner has before; None if none.
+    """
+
+    def __init__(self, stem: str, ids: Sequence[str] | None, others: np.ndarray, rank: np.ndarray | None) -> None:
+        self.stem, self.ids, self.others, self.rank = stem, ids, others, rank
+
+    def __len__(self) -> int:
+        return len(self.others)
+
+    def text(self, index: int) -> str:
+        ids, others = self.ids, self.others[index].tolist()
+        base = self.stem if ids is None or not others else f"{self.stem}({', '.join(ids[other] for other in others)})"
+        again = 0 if self.rank is None else int(self.rank[index])
+        return f"{base} #{again + 1}" if again else base

@@ -1,0 +1,82 @@
+"""The directory of a run: the record that grows, the checkpoint beside it, and the result file when it is done."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consat.errors import InvalidResult
+from consat.estimates import Estimates
+from consat.netcdf import VARIABLES, write
+from consat.result import attributes, labels, variables
+from consat.simulate import checkpoint
+from consat.simulate.checkpoint import Checkpoint
+from consat.simulate.recording import Choice, Log
+from consat.team import Team
+from consat.trace import Trace
+
+RESULT, LOG = "result.nc", "record.bin"
+SECONDS = 10.0
+"""Between two checkpoints when nobody says."""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where a run writes.
+
+    Attributes:
+        directory: made if need be.
+        seconds: between two checkpoints; None for none, or when a run is taken up for as many as before.
+        taken_up: the arrays and the rest of the checkpoint of the run that is taken up; None to begin anew.
+    """
+
+    directory: Path
+    seconds: float | None = None
+    taken_up: tuple[Mapping[str, np.ndarray], Mapping[str, Any]] | None = None
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """What the run that is taken up said of itself."""
+        return {} if self.taken_up is None else self.taken_up[1]
+
+    def sink(self, team: Team, copies: Estimates, choice: Choice, clock: str) -> Log:
+        """The record; `clock` is ``time`` or ``round``."""
+        names = variables(self._labels(team, copies, choice), integral=clock == "time")
+        sizes = {"agent": len(choice.agents), "axis": team.dimension, "copy": 0 if choice.copies is None else len(choice.copies)}
+        shapes = {name: tuple(sizes[along] for along in VARIABLES[name][0]) for name in names if clock == "time" or name != "velocity"}
+        path = self.directory / LOG
+        if self.taken_up is None:
+            return Log(path, {"step": (), **shapes}, choice.every)
+        if not path.is_file():
+            raise InvalidResult(f"{path}: this is missing, but belongs to the checkpoint beside it")
+        return Log(path, {"step": (), **shapes}, choice.every, int(self.about["tally"]["recorded"]))
+
+    def _labels(self, team: Team, copies: Estimates, choice: Choice) -> dict[str, np.ndarray]:
+        held = None if choice.copies is None else (copies.holder[choice.copies], copies.position[choice.copies])
+        return labels(team.ids, None if choice.everyone else choice.agents, copies.cluster, held)
+
+    def checkpoints(self, about: Mapping[str, Any]) -> Checkpoint | None:
+        """Where the state is kept; `about` is what must be known to go on."""
+        seconds = self.about.get("seconds", SECONDS) if self.taken_up is not None and self.seconds is None else self.seconds
+        if seconds is None:
+            return None
+        return Checkpoint(self.directory / checkpoint.NAME, seconds, {**about, "seconds": seconds}, self.taken_up)
+
+    def finish(self, log: Log, trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> Trace:
+        """Write the result file, and take away the log if no checkpoint needs it."""
+        path = self.directory / RESULT
+        copies = None if trace.estimate is None else (trace.holder, trace.held)
+        named = labels(team.ids, trace.recorded, trace.cluster, copies)
+        write(
+            path, trace.clock, variables(named, integral=trace.integral is not None), named, team.dimension,
+            count=log.count, steps=log.steps(1.0 if trace.period is None else trace.period),
+            attributes=attributes(summary, scenario), final=None if trace.recorded is None else trace.end,
+        )  # fmt: skip
+        if self.seconds is None and self.taken_up is None:
+            (self.directory / LOG).unlink()
+        return dataclasses.replace(trace, file=path)

@@ -1,0 +1,307 @@
+"""One round, for all agents at once: everybody speaks, the messages travel (or don't), everybody hears."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat import prox
+from consat.estimates import Estimates
+from consat.graphs import hops
+from consat.numerics import Groups
+from consat.objective import Nu, Objective
+from consat.protocols import Rounds, agreement
+from consat.scale import Scale
+from consat.team import Team
+
+TOLERANCE = 1e-9
+"""Of every local step, relative."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ends:
+    """Both ends of every link of every copy: `consat.protocols.Links` of all agents at once.
+
+    Attributes:
+        row: (E,) the copy at this end.
+        other: (E,) the index of the same link's other end.
+        groups: groups the ends by copy.
+        degree: (C,).
+        metropolis: (E,).
+    """
+
+    row: Array
+    other: Array
+    groups: Groups
+    degree: Array
+    metropolis: Array
+
+    @classmethod
+    def of(cls, copies: Estimates) -> Ends:
+        receiver, sender = copies.edges.T.astype(np.int64)
+        other = np.searchsorted(receiver * copies.count + sender, sender * copies.count + receiver)
+        degree = np.bincount(receiver, minlength=copies.count)
+        metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
+        return cls(
+            jnp.asarray(receiver, dtype=jnp.int32),
+            jnp.asarray(other, dtype=jnp.int32),
+            Groups.of(receiver, copies.count),
+            jnp.asarray(degree, dtype=float),
+            jnp.asarray(metropolis),
+        )
+
+    def at(self, rows: Array) -> Array:
+        return self.groups.spread(rows)
+
+    def sum(self, links: Array) -> Array:
+        return self.groups.sum(links)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Everyone:
+    """`consat.protocols.Solver`, for all agents at once.
+
+    Attributes:
+        links: all ends.
+        length: the team's unit of length.
+        center: (d,) the team's middle.
+        reach: how far around it the team's places are.
+        batches: the agents by shape.
+        nu: the smoothing.
+        local: every agent's objective over its copies.
+        holder: (C,) who holds each copy.
+        talkers: groups the ends by agent.
+        agents: N.
+        hops: see `consat.graphs.hops`.
+        convex: whether every ψ is known to be concave.
+    """
+
+    links: Ends
+    length: Array
+    center: Array
+    reach: Array
+    batches: tuple[prox.Bucket, ...]
+    nu: Nu
+    local: Objective
+    holder: Array
+    talkers: Groups
+    agents: int = field(metadata={"static": True})
+    hops: int = field(metadata={"static": True})
+    convex: bool = field(metadata={"static": True})
+
+    def recall(self, x: Array, kappa: Array) -> prox.Memory:
+        return prox.recall(self.batches, self.agents, self.nu, x, kappa)
+
+    def prox(
+        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[Array, prox.Memory, Array]:
+        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
+        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
+
+    def nearby(self, x: Array) -> Array:
+        away = (x - self.center[None, :]) / self.reach
+        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
+        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
+        return jnp.where(idle[:, None], x, self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far))
+
+    def margin(self, x: Array) -> Array:
+        return self.local.agent_margins(x)
+
+    def to_rows(self, numbers: Array) -> Array:
+        return numbers[self.holder]
+
+    def least(self, numbers: Array) -> Array:
+        return -self.talkers.max(-numbers)
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What goes wrong on the way, seeded.
+
+    Attributes:
+        loss: probability that a message between two agents is lost, each direction by itself.
+        sleep: probability that an agent skips a round: it computes and sends nothing, but hears.
+        seed: of the draws.
+    """
+
+    loss: float = 0.0
+    sleep: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body cannot jump: p ← p + clip(x − p) to at most speed/rate a round.
+
+    Attributes:
+        rate: rounds a second, Hz.
+        speed: the most that a body moves, length/s.
+    """
+
+    rate: float
+    speed: float = np.inf
+
+
+class Seen(NamedTuple):
+    """What an observer of the whole team sees after each round; leading axis T."""
+
+    position: Any
+    margin: Any
+    smooth_margin: Any
+    agent_margin: Any
+    estimate: Any
+    known: Any
+    messages: Any
+    floats: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class World:
+    """Everything a round needs that does not change.
+
+    Attributes:
+        everyone: the agents.
+        observer: of their true positions.
+        own: (N,) rows of own positions.
+        talker: (E,) who speaks at each end.
+        pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
+        reach: most that a body moves in a round.
+        loss: see `Weather`.
+        sleep: see `Weather`.
+        pairs: how many directed pairs.
+        rough: whether messages can be lost or agents sleep.
+    """
+
+    everyone: Everyone
+    observer: Objective
+    own: Array
+    talker: Array
+    pair: Array
+    reach: Array
+    loss: Array
+    sleep: Array
+    pairs: int = field(metadata={"static": True})
+    rough: bool = field(metadata={"static": True})
+
+
+class Now(NamedTuple):
+    """Everything a round changes: what the agents remember, where their bodies are, and the key of what goes wrong.
+
+    Attributes:
+        state: of the protocol.
+        ages: of `consat.protocols.agreement`.
+        body: (N, d).
+        key: of the random draws.
+    """
+
+    state: Any
+    ages: agreement.Ages
+    body: Array
+    key: Array
+
+
+def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
+    """What all agents do in one round."""
+    everyone, ends = world.everyone, world.everyone.links
+    spoken, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
+    ages, told = agreement.speak(now.ages, spoken.x, everyone)
+    arrived = jnp.ones(len(ends.row), dtype=bool)
+    key, sent, copies_sent = now.key, jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
+    if world.rough:
+        key, draw_loss, draw_sleep = jax.random.split(now.key, 3)
+        awake = jax.random.uniform(draw_sleep, (everyone.agents,)) >= world.sleep
+        spoken = _where_awake(protocol.per, world, awake, spoken, now.state)
+        ages = _where_awake({"age": "agent", "heard": "link"}, world, awake, ages, now.ages)
+        goes = awake[world.talker]
+        sent = jnp.sum(jax.ops.segment_max(goes.astype(int), world.pair, world.pairs))
+        copies_sent = jnp.sum(goes)
+        arrived = (goes & (jax.random.uniform(draw_loss, (world.pairs,)) >= world.loss)[world.pair])[ends.other]
+    state = protocol.hear(spoken, jax.tree.map(lambda leaf: leaf[ends.other], message), arrived, everyone)
+    ages = agreement.hear(ages, told[ends.other], arrived)
+    target = state.x[world.own]
+    away = target - now.body
+    distance = jnp.linalg.norm(away, axis=1, keepdims=True)
+    body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
+    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
+    known = jnp.all(agreement.known(ages, everyone) > 0)
+    return Now(state, ages, body, key), see(world, state.x, body, known, sent, floats)
+
+
+def see(world: World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
+    """What an observer sees of estimates x and positions `body`."""
+    margins = world.observer.agent_margins(body)
+    smooth = world.observer.smooth_margin(body, world.everyone.nu)
+    return Seen(body, jnp.min(margins), smooth, margins, x, known, messages, floats)
+
+
+def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
+    """The new state of those awake, the old one of those asleep."""
+    masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
+
+    def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
+        if isinstance(per, str):
+            return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
+        return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
+
+    return choose(per, new, old)
+
+
+def many_rounds(
+    protocol: Rounds, world: World, now: Now, numbers: Array, look: Callable[[Seen], Any] = lambda seen: seen
+) -> tuple[Now, Any]:
+    """The rounds of these numbers, and of each what `look` keeps, stacked."""
+
+    def step(at: Now, number: Array) -> tuple[Now, Any]:
+        at, seen = one_round(protocol, world, at, number)
+        return at, look(seen)
+
+    return jax.lax.scan(step, now, numbers)
+
+
+def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now, Seen]:
+    """The start from first estimates, (C, d), and what is seen of it."""
+    start = first[world.own]
+    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key)
+    return now, see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0))
+
+
+def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None) -> World:
+    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`."""
+    ends = Ends.of(copies)
+    everyone = Everyone(
+        links=ends,
+        length=jnp.asarray(size.length),
+        center=jnp.asarray(size.center),
+        reach=jnp.asarray(size.reach),
+        batches=prox.buckets(team, copies.rows, copies.count, convex),
+        nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
+        local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
+        holder=jnp.asarray(copies.holder),
+        talkers=Groups.of(copies.holder[copies.edges[:, 0]], team.count),
+        agents=team.count,
+        hops=hops(team.count, copies.links),
+        convex=convex,
+    )
+    talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
+    pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)
+    return World(
+        everyone=everyone,
+        observer=Objective.at_positions(team),
+        own=jnp.asarray(copies.own),
+        talker=jnp.asarray(talker, dtype=jnp.int32),
+        pair=jnp.asarray(pair, dtype=jnp.int32),
+        reach=jnp.asarray(np.inf if body is None else body.speed / body.rate),
+        loss=jnp.asarray(weather.loss),
+        sleep=jnp.asarray(weather.sleep),
+        pairs=len(pairs),
+        rough=weather.loss > 0 or weather.sleep > 0,
+    )
