@@ -155,6 +155,16 @@ def encode(message: Message) -> bytes:
     return body + _CHECKSUM.pack(crc32(body))
 
 
+def claims(payload: bytes, source: str) -> bool:
+    """Whether the message says that it is from `source`. Nothing else of it is looked at.
+
+    A transport that knows who wrote a message asks this, so that no neighbour can speak in another's name.
+    """
+    name = _name(source)
+    at = _HEADER.size
+    return payload[at - 4 : at - 2] == len(name).to_bytes(2, "little") and payload.startswith(name, at)
+
+
 class Checker:
     """Stands at the door of one agent: hands on what is well-formed, for it, from a neighbour, of this problem, and new; counts the rest.
 
