@@ -15,6 +15,7 @@ import click
 
 from consat import __version__
 from consat.errors import ConsatError, InvalidInput, InvalidSettings
+from consat.network.keys_command import keys
 
 if TYPE_CHECKING:
     from consat.scenario import Scenario
@@ -193,6 +194,9 @@ def animate(result: Path, out: Path | None) -> None:
     loaded = Result.load(result)
     with _progress(quiet=False) as progress:
         click.echo(animation.save(loaded, out or result.with_suffix(".gif"), progress=lambda done: progress(done, None)))
+
+
+cli.add_command(keys)
 
 
 def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:

@@ -6,6 +6,8 @@ import hashlib
 from typing import Final
 from urllib.parse import quote
 
+from consat.errors import NetworkError, shown
+
 LONGEST: Final = 64
 """Characters of a certificate's common name (RFC 5280, ub-common-name)."""
 
@@ -16,5 +18,10 @@ def spelled(text: str) -> str:
     Everything else is percent-encoded, the dot too: `..` is a directory. What is longer is told by its hash, in the form ``%%…`` that no
     encoding has.
     """
-    name = quote(text, safe="").replace(".", "%2E")
+    try:
+        name = quote(text, safe="").replace(".", "%2E")
+    except UnicodeEncodeError:
+        raise NetworkError(f"a name must be text that UTF-8 can write, but {shown(text)} is not") from None
+    if not name:
+        raise NetworkError("a name must not be empty")
     return name if len(name) <= LONGEST else "%%" + hashlib.sha256(text.encode()).hexdigest()[: LONGEST - 2]
