@@ -137,9 +137,7 @@ def _restricted(team: Team, kept: Sequence[int]) -> Team:
     place[list(kept)] = np.arange(len(kept))
     whole = [np.all(place[family.agents] >= 0, axis=1) for family in team.families]
     numbers = np.sort(
-        np.concatenate(
-            [np.zeros(0, dtype=np.int32), *(family.number[stays] for family, stays in zip(team.families, whole, strict=True))]
-        )
+        np.concatenate([np.zeros(0, dtype=np.int32), *(family.number[stays] for family, stays in zip(team.families, whole, strict=True))])
     )
     families = [_members(family, np.flatnonzero(stays), place, numbers) for family, stays in zip(team.families, whole, strict=True)]
     bare = Team([Agent(team.ids[i], (), team.starts[i] if np.isfinite(team.starts[i]).all() else None) for i in kept], [], team.dimension)
