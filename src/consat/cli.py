@@ -15,6 +15,7 @@ import click
 
 from consat import __version__
 from consat.errors import ConsatError, InvalidInput, InvalidSettings
+from consat.network.commands import agent, launch, split
 from consat.network.keys_command import keys
 
 if TYPE_CHECKING:
@@ -196,7 +197,8 @@ def animate(result: Path, out: Path | None) -> None:
         click.echo(animation.save(loaded, out or result.with_suffix(".gif"), progress=lambda done: progress(done, None)))
 
 
-cli.add_command(keys)
+for command in (split, agent, launch, keys):
+    cli.add_command(command)
 
 
 def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:

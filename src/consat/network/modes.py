@@ -99,12 +99,20 @@ def core_of(part: Part, manner: Manner) -> Core:
 
 
 def runner_of(
-    part: Part, manner: Manner, transport: Transport, *, clock: Callable[[], float], incarnation: int, body: Body, log: Log
+    part: Part,
+    manner: Manner,
+    transport: Transport,
+    *,
+    clock: Callable[[], float],
+    incarnation: int,
+    body: Body,
+    log: Log,
+    core: Core | None = None,
 ) -> Runner:
-    """An agent ready to run; its first step will begin."""
+    """An agent ready to run; its first step will begin. `core` is what `core_of` gives, if that is at hand."""
     lockstep = manner.mode == "lockstep"
     station = Station(
-        part, core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
+        part, core or core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
         frames=2 if lockstep else 1, stamped=lockstep, give_up=manner.give_up, report=manner.report,
     )  # fmt: skip
     if lockstep:

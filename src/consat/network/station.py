@@ -122,6 +122,11 @@ class Station:
             first[self.part.team.ids.index(self.part.me)] = position
         return first
 
+    @property
+    def satisfied(self) -> bool:
+        """Whether it knows that all are."""
+        return self._satisfied
+
     # -- messages ----------------------------------------------------------------------------------------------------------------------
 
     def hear(self) -> list[Message]:
