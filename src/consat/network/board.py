@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consat.network.gather import Observer, Seen
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @contextmanager
@@ -25,8 +29,8 @@ def board(title: str, *, quiet: bool) -> Iterator[Callable[[Observer, Mapping[st
         yield lambda observer, running, seconds: live.update(table(title, observer, running, seconds))
 
 
-def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: float) -> object:
-    """A `rich.table.Table`."""
+def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: float) -> Table:
+    """Drawn with rich."""
     from rich.table import Table
     from rich.text import Text
 

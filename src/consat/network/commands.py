@@ -20,7 +20,9 @@ MODES = ["lockstep", "link", "admm"]
 scenario_argument = click.argument("scenario", metavar="FILE")
 set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
 protocol_option = click.option("--protocol", metavar="KIND", help="For --mode lockstep: admm (default), proximal, max-min.")
-estimates_option = click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
+estimates_option = click.option(
+    "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."
+)
 port_option = click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Of the first agent.")
 mode_option = click.option("--mode", type=click.Choice(MODES), default="admm", show_default=True, help="How they talk.")
 rate_option = click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Turns a second.")
@@ -38,7 +40,7 @@ keys_option = click.option(
 )
 
 
-class _Delay(click.ParamType):
+class _Delay(click.ParamType[tuple[float, float]]):
     """``S`` or ``A,B``, seconds."""
 
     name = "S | A,B"
@@ -55,7 +57,7 @@ class _Delay(click.ParamType):
         return ends[0], ends[-1]
 
 
-class _Position(click.ParamType):
+class _Position(click.ParamType[tuple[float, ...]]):
     """Numbers with commas between them."""
 
     name = "X,Y"
@@ -87,7 +89,8 @@ delay_option = click.option("--delay", type=_Delay(), default=(0.0, 0.0), help="
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
 def split(
-    scenario: str, overrides: tuple[str, ...], out: Path, addresses: tuple[str, ...], port: int, absent: tuple[str, ...], run: str | None,
+    *, scenario: str, overrides: tuple[str, ...], out: Path,
+    addresses: tuple[str, ...], port: int, absent: tuple[str, ...], run: str | None,
     protocol: str | None, estimates: str | None, seed: int | None,
 ) -> None:  # fmt: skip
     """Write one private file an agent: its own constraints, its neighbours' names and addresses, and nothing of the others."""
@@ -135,7 +138,7 @@ def split(
 @click.option("--attached", is_flag=True, help="Read orders from stdin, and stop when it ends.")
 @port_option
 def agent(
-    scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
+    *, scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
     rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, **around: Any,
 ) -> int:  # fmt: skip
     """Run one agent: from its private FILE, or its own part of a scenario. Events are JSON lines on stdout."""
@@ -176,7 +179,7 @@ def agent(
 @click.option("--quiet", is_flag=True, help="No table and no summary.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
 def launch(
-    scenario: str, overrides: tuple[str, ...], protocol: str | None, estimates: str | None, seed: int | None, keys: Path | None,
+    *, scenario: str, overrides: tuple[str, ...], protocol: str | None, estimates: str | None, seed: int | None, keys: Path | None,
     out: Path | None, full: bool, quiet: bool, as_json: bool, **plan: Any,
 ) -> int:  # fmt: skip
     """Start every agent of a team as a process on this machine, watch them, and gather a result."""
@@ -265,4 +268,3 @@ def _keys(given: Path | None, file: str, agents: Any) -> Path | None:
     if found:
         click.echo(f"links are protected by the keys in {beside}", err=True)
     return beside if found else None
-

@@ -141,7 +141,7 @@ class RoundCore:
         return self._begin(self.protocol, self.solver, first)
 
     def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
-        now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, inbox, arrived, moment.round)
+        now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived), moment.round)
         return now, np.asarray(outbox), Look(np.asarray(x), float(margin[0]), float(known[0]))
 
     def among(self, gone: Collection[str]) -> RoundCore:
@@ -188,8 +188,9 @@ def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
 
 
 def _turn(
-    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, inbox: Array, arrived: Array, round_: Array
+    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array], round_: Array
 ) -> tuple[_Now, Array, Array, Array, Array]:
+    inbox, arrived = heard
     state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
     ages = agreement.hear(now.ages, inbox[:, -1], arrived)
     state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import selectors
 import socket
 import subprocess
@@ -24,6 +25,9 @@ from consat.network.part import Part, write_part
 PATIENCE: Final = 3.0
 """An agent told to stop has so long, s, before it is ended."""
 LARGEST_READ: Final = 2**20
+
+PORTS: Final = (10240, 32768)
+"""Among which a team's are chosen."""
 
 Event = Mapping[str, Any]
 
@@ -82,9 +86,8 @@ class Fleet:
             sys.executable, "-c", "from consat.cli import main; main()", "agent", str(self.file(agent)), "--id", agent, "--attached",
             *self.options, *options,
         ]  # fmt: skip
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
-        )  # noqa: S603 - own program, own arguments  # fmt: skip
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment, start_new_session=True)  # noqa: S603 - our own
         child = _Child(process)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
@@ -125,7 +128,7 @@ class Fleet:
         for key, _ in self._selector.select(timeout):
             _, child = key.data
             assert child.process.stdout is not None
-            data = child.process.stdout.read1(LARGEST_READ)  # type: ignore[attr-defined]
+            data = child.process.stdout.read1(LARGEST_READ)
             if not data:
                 self._selector.unregister(child.process.stdout)
                 continue
@@ -161,17 +164,22 @@ class Fleet:
 def free_ports(count: int) -> list[int]:
     """Ports of this machine that nobody listens at.
 
+    They lie below those that systems give to connections going out: an agent that tries to reach a neighbour that is not there yet might
+    get that neighbour's port.
+
     Raises:
         NetworkError: there are not so many.
     """
-    sockets = []
-    try:
-        for _ in range(count):
-            sockets.append(socket.socket())
-            sockets[-1].bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
-    except OSError as error:
-        raise NetworkError(f"there are no {count} free ports on 127.0.0.1: {error}") from None
-    finally:
-        for each in sockets:
-            each.close()
+    found: list[int] = []
+    candidates = list(range(*PORTS))
+    random.shuffle(candidates)
+    for port in candidates:
+        if len(found) == count:
+            return found
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            found.append(port)
+    raise NetworkError(f"there are no {count} free ports on 127.0.0.1 between {PORTS[0]} and {PORTS[1]}")

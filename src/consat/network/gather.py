@@ -65,6 +65,8 @@ class Seen:
                 self.finished = True
             case "end":
                 self.ended = event
+            case _:
+                return
 
     @property
     def sent(self) -> Counter[str]:

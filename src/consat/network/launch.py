@@ -186,4 +186,3 @@ def _ending(observer: Observer, stop: Stop, rules: _Rules) -> Ending | None:
     if stop != "never" and latest >= rules.earliest and observer.settled(rules.window, rules.distance):
         return "settled"
     return None
-

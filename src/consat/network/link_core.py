@@ -29,8 +29,8 @@ from consat.network.alone import Alone, ends
 from consat.network.core import Core, Kept, Look, Moment
 from consat.network.part import Part
 from consat.numerics import quick_compilation
-from consat.prox import Memory
 from consat.protocols import agreement
+from consat.prox import Memory
 
 AGREE = 0.05
 """ε."""

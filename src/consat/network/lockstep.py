@@ -103,7 +103,7 @@ class Lockstep:
         return self._round == 0 or all(map(self._heard, self.station.present))
 
     def _heard(self, neighbour: str) -> bool:
-        """Whether nothing more is to be expected of a neighbour in the round before: it was heard, or is so far on that it never will be."""
+        """Whether a neighbour has nothing more to say about the round before: it was heard, or is too far on to repeat that."""
         return (neighbour, self._round - 1) in self._blocks or self._reached.get(neighbour, 0) > self._round
 
     def _catch_up(self) -> None:

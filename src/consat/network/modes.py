@@ -1,4 +1,4 @@
-"""From a part and a word, such as ``admm``, to an agent that runs: which core, which way of taking turns, which demands on the transport."""
+"""From a part and a word, such as ``admm``, to an agent that runs: which core, which way of taking turns, what it asks of the transport."""
 
 from __future__ import annotations
 

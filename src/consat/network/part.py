@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -331,7 +331,7 @@ def _must(message: str) -> str:
     return message.removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
 
 
-def _unfit(frame: _File, team: Team, settings: Settings) -> Any:
+def _unfit(frame: _File, team: Team, settings: Settings) -> Iterator[Fault]:
     """Where the frame and the scenario within contradict each other."""
     if set(frame.first) != set(team.ids):
         yield Fault(("first",), f"first must have the agents of the scenario within, {', '.join(team.ids)}")
@@ -345,6 +345,10 @@ def _unfit(frame: _File, team: Team, settings: Settings) -> Any:
     smoothing = settings.smoothing
     if not isinstance(smoothing, Smoothing) or not isinstance(smoothing.nu_beta, float):
         yield Fault(("scenario",), "smoothing must give nu_alpha and nu_beta as numbers, for all agents must have the same")
+    yield from _unfit_neighbours(frame, team)
+
+
+def _unfit_neighbours(frame: _File, team: Team) -> Iterator[Fault]:
     known: set[str] = {frame.agent}
     for k, neighbour in enumerate(frame.neighbours):
         path = ("neighbours", k)

@@ -98,9 +98,18 @@ class Peers:
         echo, ack = (np.nan, 0) if peer.last is None else (peer.last.sent + (now - peer.heard), peer.last.sequence)
         payload = encode(
             Message(
-                kind, self._problem, self._part.me, neighbour, self._incarnation, peer.sequence, now, echo, ack,
-                float(self._part.nu.beta), tuple(arrays),
-            )  # fmt: skip
+                kind,
+                self._problem,
+                self._part.me,
+                neighbour,
+                self._incarnation,
+                peer.sequence,
+                now,
+                echo,
+                ack,
+                float(self._part.nu.beta),
+                tuple(arrays),
+            )
         )
         self._transport.send(neighbour, payload)
         self.sent["messages"] += 1

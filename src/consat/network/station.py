@@ -183,9 +183,7 @@ class Station:
     def _listeners(self) -> list[str]:
         """The neighbours that are there, and those who are not, but speak: they may not know."""
         now = self.clock()
-        return [
-            neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT
-        ]
+        return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
 
     # -- time --------------------------------------------------------------------------------------------------------------------------
 

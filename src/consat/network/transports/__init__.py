@@ -1,4 +1,4 @@
-"""What an agent needs of a network: to send bytes to its neighbours, and to find what they sent. Everything else may go wrong on the way."""
+"""What an agent needs of a network: to send bytes to its neighbours, and to find what they sent. All else may go wrong on the way."""
 
 from __future__ import annotations
 
