@@ -11,7 +11,7 @@ import json
 import re
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from consat.errors import NetworkError
@@ -55,7 +55,9 @@ def connect(
         if endpoint.startswith("tls/") != (credentials is not None):
             raise NetworkError(f"with keys every address must begin with tls/, without keys none may, but one is {endpoint!r}")
     config = zenoh.Config()
-    settings = _settings(listen, neighbours.values())
+    # Of two neighbours one connects: were it both, a link that is made anew while one end still holds the old one could become a second
+    # link of the old session there, which then never tells the other end again that it is up and what it listens to.
+    settings = _settings(listen, [endpoint for neighbour, endpoint in neighbours.items() if spelled(neighbour) < spelled(me)])
     if credentials is not None:
         for path in (credentials.ca, credentials.certificate, credentials.key):
             if not path.is_file():
@@ -87,21 +89,23 @@ def _token(run: str, agent: str) -> str:
     return f"consat/{spelled(run)}/v1/live/{spelled(agent)}"
 
 
-def _settings(listen: str, connect: Any) -> dict[str, Any]:
+def _settings(listen: str, connect: Sequence[str]) -> dict[str, Any]:
     """Peers connect where they are told to, find nobody by themselves, and never give up."""
     return {
         "mode": "peer",
         "listen/endpoints": [listen],
-        "connect/endpoints": list(connect),
+        "connect/endpoints": connect,
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         "adminspace/enabled": False,
         "transport/link/tx/lease": LEASE,
+        # A neighbour that hangs must not hold up the others' messages for longer than it takes to notice.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 1000 * LEASE,
         "transport/link/rx/max_message_size": 2 * wire.LONGEST,
         # TLS does not cover what neighbours on one machine would pass through shared memory.
         "transport/shared_memory/enabled": False,
