@@ -19,6 +19,7 @@ from consat.network.alone import Alone, ends
 from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import Rounds, agreement
+from consat.prox import Memory
 
 
 class Moment(NamedTuple):
@@ -152,6 +153,25 @@ class RoundCore:
         return _Now(kept.merge(self.protocol.per, state.state, fresh.state), kept.merge(_AGES, state.ages, fresh.ages))
 
 
+class _Outline:
+    """A solver that gives what a true one gives, but for the values: enough to find the shape of a message, and quick to trace."""
+
+    def __init__(self, solver: Alone) -> None:
+        self.links, self.length, self.hops = solver.links, solver.length, solver.hops
+        self.to_rows, self.least = solver.to_rows, solver.least
+
+    def recall(self, x: Array, kappa: Array) -> Memory:
+        return Memory(jnp.zeros(1), jnp.ones(1))
+
+    def prox(
+        self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[Array, Memory, Array]:
+        return v, memory, kappa
+
+    def margin(self, x: Array) -> Array:
+        return jnp.zeros(1)
+
+
 class _Layout(NamedTuple):
     """What a message consists of: its structure, and for each array the shape of what one end sends."""
 
@@ -161,10 +181,10 @@ class _Layout(NamedTuple):
     @classmethod
     def of(cls, protocol: Rounds, solver: Alone, dimension: int) -> _Layout:
         """Found by tracing, not by running."""
-        first = jax.ShapeDtypeStruct((solver.rows, dimension), float)
+        first, outline = jax.ShapeDtypeStruct((solver.rows, dimension), float), _Outline(solver)
 
         def message(x: Array) -> Any:
-            return protocol.speak(protocol.start(x, solver), solver, jnp.asarray(0.0), jnp.zeros(1))[1]
+            return protocol.speak(protocol.start(x, outline), outline, jnp.asarray(0.0), jnp.zeros(1))[1]
 
         leaves, structure = jax.tree.flatten(jax.eval_shape(message, first))
         return cls(structure, tuple(leaf.shape[1:] for leaf in leaves))

@@ -127,17 +127,18 @@ class Observer:
             agents[agent] = {
                 "sent": dict(seen.sent), "dropped": report.get("dropped", {}), "cpu": None if seen.ended is None else seen.ended.get("cpu"),
             }  # fmt: skip
+        known = self.all_known()
         trips = [link["trip"] for link in links if link["trip"] is not None]
         return {
             "loss": float(np.mean([link["loss"] for link in links])) if links else None,
             "round_trip": float(np.median(trips)) if trips else None,
-            "known_from": self.all_known(),
+            "known_from": None if known is None else known - (self._begin() if self.clock == "time" else 0.0),
             "agents": agents,
         }
 
     def trace(self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float]) -> Trace:
         """All of it as a trace. Positions between two stamps are those at the earlier one."""
-        begin = min((seen.stamps[0] for seen in self.seen.values() if seen.stamps), default=0.0)
+        begin = self._begin()
         end = max((seen.stamps[-1] for seen in self.seen.values() if seen.stamps), default=0.0)
         if self.clock == "round":
             stamps = steps = np.arange(int(end) + 1, dtype=float)
@@ -169,6 +170,10 @@ class Observer:
             known_from=int(known) if known is not None and self.clock == "round" else None,
             seconds=seconds,
         )
+
+    def _begin(self) -> float:
+        """The first stamp."""
+        return min((seen.stamps[0] for seen in self.seen.values() if seen.stamps), default=0.0)
 
     def _along(self, seen: Seen, start: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         order = np.argsort(seen.stamps, kind="stable")
