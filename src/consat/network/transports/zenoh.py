@@ -118,7 +118,7 @@ def _protection(credentials: Credentials) -> dict[str, Any]:
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": str(credentials.ca),
-            "enable_mtls": False,
+            "enable_mtls": True,
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
             "listen_certificate": certificate,
