@@ -24,6 +24,7 @@ from consat.errors import NetworkError
 from consat.network import keys
 from consat.network.keys_command import keys as keys_command
 from consat.network.names import spelled
+from consat.network.transports import zenoh as transport
 from consat.network.transports.zenoh import _key, _protection, _settings, _token, connect
 from tests.networked.loopback import SILENCE, delivered, endpoints, letter, team, until
 
@@ -150,6 +151,33 @@ def test_rogue_delivers_nothing(kind: str, home: Path, foreign: Path) -> None:
                 assert not list(session.info.peers_zid())
     assert len(got) > 10, "positive control: the friend is heard meanwhile"
     assert set(got) == {friendly}
+
+
+def test_without_mutual_tls_one_without_a_certificate_would_get_in(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: the test above can fail. Access control stays on, and still keeps its messages out."""
+    protection = _protection(keys.load(home, "a"))
+    protection["transport/link/tls"]["enable_mtls"] = False
+    nameless = _protection(keys.load(home, "outsider"))
+    nameless["transport/link/tls"] |= {"enable_mtls": False, "connect_certificate": None, "connect_private_key": None}
+    (at_a, at_b, listen) = endpoints(3, "tls")
+    with team() as agents:
+        monkeypatch.setattr(transport, "_protection", lambda _: protection)
+        a = agents.join("a", at_a, {"b": at_b}, credentials=keys.load(home, "a"))
+        with rogue(listen, at_a, **nameless) as session:
+            until(session.info.peers_zid)
+            assert not attack(session, a, FORGED, lambda: None)
+
+
+def test_without_access_control_an_insider_would_get_in(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control of the tests below."""
+    at_a, at_b, at_c = endpoints(3, "tls")
+    with team() as agents:
+        monkeypatch.setattr(transport, "_access", lambda *_: {"enabled": False})
+        a = agents.join("a", at_a, {"b": at_b, "c": at_c}, credentials=keys.load(home, "a"))
+        with insider(at_a, keys.load(home, "b")) as session:
+            until(session.info.peers_zid)
+            got = attack(session, a, FORGED, lambda: None)
+    assert letter("c", "a", 1000, 66.6) in got
 
 
 def insider(at_a: str, credentials: keys.Credentials) -> Any:
