@@ -6,8 +6,12 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
+import shlex
 import shutil
 import stat
+import subprocess
+import sysconfig
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,6 +32,7 @@ from consat.network.transports import zenoh as transport
 from consat.network.transports.zenoh import _key, _protection, _settings, _token, connect
 from tests.networked.loopback import SILENCE, delivered, endpoints, letter, team, until
 
+SCRIPTS = Path(sysconfig.get_path("scripts"))
 IDS = ("a", "b", "c", "outsider")
 
 
@@ -267,6 +272,19 @@ def test_who_takes_a_dead_neighbours_address_without_keys_hears_all() -> None:
         until(lambda: b.send("a", letter("b", "a")) or heard)
 
 
+def test_links_close_when_a_certificate_expires(tmp_path: Path) -> None:
+    keys.make(["a", "b"], tmp_path)
+    pair = keys._issue("b", keys._read_authority(tmp_path), keys._alternatives(["127.0.0.1"]), 4 / 86400)
+    (tmp_path / "b" / "certificate.pem").write_bytes(keys._pem(pair.certificate))
+    (tmp_path / "b" / "key.pem").write_bytes(keys._private_pem(pair.key))
+    at_a, at_b = endpoints(2, "tls")
+    with team() as agents:
+        a = agents.join("a", at_a, {"b": at_b}, credentials=keys.load(tmp_path, "a"))
+        agents.join("b", at_b, {"a": at_a}, credentials=keys.load(tmp_path, "b"))
+        until(a.alive)
+        assert until(lambda: not a.alive()) < 10
+
+
 def test_keys_want_tls_everywhere(home: Path) -> None:
     """Nothing falls back to an open link because of an address."""
     for listen, other in (("tcp/127.0.0.1:1", "tls/127.0.0.1:2"), ("tls/127.0.0.1:1", "tcp/127.0.0.1:2")):
@@ -445,3 +463,20 @@ def test_command_makes_keys_of_a_scenario_and_of_ids(tmp_path: Path) -> None:
     assert run(keys_command, ["a4", "--out", str(tmp_path / "k"), "--replace"]).exit_code == 0
     assert run(keys_command, ["--out", str(tmp_path / "k")]).exit_code == 2
     assert run(keys_command, ["a", "b", "--set", "count=2", "--out", str(tmp_path / "k")]).exit_code == 2
+
+
+def test_commands_of_the_documentation_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that need no robot."""
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
+    lines = "\n".join(re.findall(r"^```sh\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)).splitlines()
+    lines += re.findall(r"`(consat keys [^`]*)`", text)
+    commands = [shlex.split(line) for line in lines if line.startswith("consat ")]
+    assert len(commands) == 5
+    for program, *arguments in commands:
+        done = subprocess.run([SCRIPTS / program, *arguments], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, (arguments, done.stderr)
+    keys.load(tmp_path / "keys", "a4")
+    assert (tmp_path / "parts" / "a1.yaml").is_file()
+    for path in re.findall(r"(?:keys/\S+\.pem)", text):
+        assert (tmp_path / path).is_file(), path

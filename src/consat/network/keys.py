@@ -151,7 +151,7 @@ def _alternatives(addresses: Iterable[str]) -> list[x509.GeneralName]:
     return names
 
 
-def _builder(subject: str, issuer: str, key: EllipticCurvePrivateKey, days: int, *, authority: bool) -> x509.CertificateBuilder:
+def _builder(subject: str, issuer: str, key: EllipticCurvePrivateKey, days: float, *, authority: bool) -> x509.CertificateBuilder:
     """What certificates of agents and of the authority have in common."""
     from cryptography import x509
 
@@ -183,7 +183,7 @@ def _new_authority() -> _Pair:
     return _Pair(key, _builder(name, name, key, AUTHORITY_DAYS, authority=True).sign(key, hashes.SHA256()))
 
 
-def _issue(id_: str, authority: _Pair, names: list[x509.GeneralName], days: int) -> _Pair:
+def _issue(id_: str, authority: _Pair, names: list[x509.GeneralName], days: float) -> _Pair:
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
