@@ -168,6 +168,14 @@ def test_largest_is_a_limit_of_each_array() -> None:
     assert door.counts == {Reason.NUMBER: 2}
 
 
+def test_largest_may_differ_by_column() -> None:
+    door = Checker("a2", {"a1": {Kind.STATE: [Numbers((2, 2), (10.0, math.inf))]}}, PROBLEM)
+    good, bad = np.array([[9.0, math.inf], [-9.0, -math.inf]]), np.array([[9.0, 0.0], [11.0, 0.0]])
+    assert door.accept(encode(message(arrays=(good,)))) is not None
+    assert door.accept(encode(message(sequence=8, arrays=(bad,)))) is None
+    assert door.accept(encode(message(sequence=9, arrays=(np.full((2, 2), math.nan),)))) is None
+
+
 def test_claims_tells_whose_name_is_on_it() -> None:
     payload = encode(message())
     assert claims(payload, "a1")

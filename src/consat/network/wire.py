@@ -120,11 +120,11 @@ class Numbers(NamedTuple):
 
     Attributes:
         shape: (n,) or (rows, columns).
-        largest: no magnitude is above it. With inf, infinities may stand in this array; NaN may stand in none.
+        largest: no magnitude is above it, or above that of its column. With inf, infinities may stand there; NaN may stand nowhere.
     """
 
     shape: tuple[int, ...]
-    largest: float = sys.float_info.max
+    largest: float | tuple[float, ...] = sys.float_info.max
 
 
 Expected = Mapping[Kind, Sequence[Numbers | tuple[int, ...]]]
@@ -297,7 +297,8 @@ class _Layout:
         sizes = [math.prod(array.shape) for array in each]
         ends = np.cumsum(sizes, dtype=int).tolist()
         slices = tuple((end - size, end, array.shape) for end, size, array in zip(ends, sizes, each, strict=True))
-        largest = np.repeat([array.largest for array in each], sizes)
+        limits = [np.broadcast_to(np.asarray(array.largest, dtype=float), array.shape).ravel() for array in each]
+        largest = np.concatenate([np.zeros(0), *limits])
         if len(set(largest.tolist())) == 1:
             largest = largest[:1]
         total = len(shapes) + 8 * sum(sizes)
