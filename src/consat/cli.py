@@ -15,6 +15,8 @@ import click
 
 from consat import __version__
 from consat.errors import ConsatError, InvalidInput, InvalidSettings
+from consat.network.commands import agent, launch, split
+from consat.network.keys_command import keys
 
 if TYPE_CHECKING:
     from consat.scenario import Scenario
@@ -223,6 +225,10 @@ def animate(result: Path, out: Path | None) -> None:
     loaded = Result.load(result)
     with _progress(quiet=False) as progress:
         click.echo(animation.save(loaded, out or result.with_suffix(".gif"), progress=lambda done: progress(done, None)))
+
+
+for command in (split, agent, launch, keys):
+    cli.add_command(command)
 
 
 def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:

@@ -90,6 +90,10 @@ class InvalidSettings(ConsatError, ValueError):
     """Settings of a run that do not fit together, e.g. a protocol that does not exist."""
 
 
+class NetworkError(ConsatError):
+    """Agents cannot be put on the network as asked: a library, a port or keys are missing or unfit, or a message cannot be written."""
+
+
 def closest(name: Any, known: Iterable[str]) -> str:
     """``; did you mean 'within'?`` if one of the `known` names is close to `name`, else nothing."""
     by_lower = {each.lower(): each for each in known}

@@ -18,7 +18,7 @@ from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.objective import Objective, Schedule, weigh
-from consat.protocols import FLOWS, ROUNDS
+from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.quadratics import shape_of
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
@@ -249,14 +249,14 @@ def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simula
 
 def _flow(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
     return simulate_flow(
-        on.team, _with_gains(FLOWS[str(asked.kind)](), asked), on.copies, on.schedule, on.first,
+        on.team, with_gains(FLOWS[str(asked.kind)](), asked), on.copies, on.schedule, on.first,
         infeasible=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible", **options,
     )  # fmt: skip
 
 
 def _rounds(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
     return simulate_rounds(
-        on.team, _with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first,
+        on.team, with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first,
         convex=bool(shape_of(on.team).concave.all()),
         hopeless=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible",
         enough=(lambda position: _gap(on.team, position) <= SHARP * on.size.psi) if asked.kind == "max-min" else None, **options,
@@ -399,14 +399,6 @@ def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
     except InvalidInput:
         text = ""
     return Scenario(name="team", team=team, settings=Settings(), text=text, source="team")
-
-
-def _with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
-    """The protocol with the gains that the scenario asks for."""
-    gains = {key: value for key, value in asked.model_dump().items() if key not in ("kind", "estimates") and value is not None}
-    if unknown := gains.keys() - {field.name for field in dataclasses.fields(protocol)}:
-        raise InvalidSettings(f"protocol {asked.kind} has no gain {', '.join(sorted(unknown))}; leave it out")
-    return dataclasses.replace(protocol, **gains)
 
 
 def _status(trace: Trace, margin: float | None, verdict: str, length: float) -> str:

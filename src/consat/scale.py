@@ -48,6 +48,29 @@ class Scale(NamedTuple):
         return MARGIN * self.length + self.spread
 
 
+class Region(NamedTuple):
+    """Where a team's places are, as every agent knows it.
+
+    Attributes:
+        center: (d,) the team's middle, length.
+        reach: how far around it the places are on each axis, length.
+    """
+
+    center: jax.Array
+    reach: jax.Array
+
+    @classmethod
+    def of(cls, size: Scale) -> Region:
+        return cls(jnp.asarray(size.center), jnp.asarray(size.reach))
+
+    def nearby(self, x: jax.Array) -> jax.Array:
+        """(n, d) positions: unchanged inside, and from far away brought to at most twice as far out as inside, keeping their directions, so
+        that no two fall together."""
+        away = (x - self.center[None, :]) / self.reach
+        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
+        return self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far)
+
+
 @functools.lru_cache(maxsize=16)
 @float64
 def scale(team: Team) -> Scale:

@@ -1,8 +1,10 @@
 """The protocols, one a file with its equation first. To add one, write such a file and list it here."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final
 
+from consat.errors import InvalidSettings
 from consat.protocols.admm import Admm
 from consat.protocols.base import Flow, Links, Local, Rounds, Solver, State
 from consat.protocols.gradient_flow import GradientFlow
@@ -10,6 +12,7 @@ from consat.protocols.max_min import MaxMin
 from consat.protocols.proportional_integral import ProportionalIntegral
 from consat.protocols.proximal import Proximal
 from consat.protocols.selfish import Selfish
+from consat.settings import ProtocolSettings
 
 FLOWS: Final[Mapping[str, Callable[[], Flow]]] = {flow.name: flow for flow in (GradientFlow, ProportionalIntegral, Selfish)}
 """What ``--protocol`` may say of continuous time."""
@@ -17,7 +20,16 @@ FLOWS: Final[Mapping[str, Callable[[], Flow]]] = {flow.name: flow for flow in (G
 ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {rounds.name: rounds for rounds in (Admm, Proximal, MaxMin)}
 """What ``--protocol`` may say of rounds."""
 
+
+def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
+    """The protocol with the gains that the scenario asks for. Raises: InvalidSettings: it has no such gain."""
+    gains = {key: value for key, value in asked.model_dump().items() if key not in ("kind", "estimates") and value is not None}
+    if unknown := gains.keys() - {field.name for field in dataclasses.fields(protocol)}:
+        raise InvalidSettings(f"protocol {asked.kind} has no gain {', '.join(sorted(unknown))}; leave it out")
+    return dataclasses.replace(protocol, **gains)
+
+
 __all__ = [
     "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Links", "Local", "MaxMin", "ProportionalIntegral", "Proximal", "Rounds", "Selfish",
-    "Solver", "State",
+    "Solver", "State", "with_gains",
 ]  # fmt: skip

@@ -17,7 +17,7 @@ from consat.graphs import hops
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
-from consat.scale import Scale
+from consat.scale import Region, Scale
 from consat.team import Team
 
 TOLERANCE = 1e-9
@@ -72,8 +72,7 @@ class Everyone:
     Attributes:
         links: all ends.
         length: the team's unit of length.
-        center: (d,) the team's middle.
-        reach: how far around it the team's places are.
+        region: where the team's places are.
         batches: the agents by shape.
         nu: the smoothing.
         local: every agent's objective over its copies.
@@ -86,8 +85,7 @@ class Everyone:
 
     links: Ends
     length: Array
-    center: Array
-    reach: Array
+    region: Region
     batches: tuple[prox.Bucket, ...]
     nu: Nu
     local: Objective
@@ -107,10 +105,8 @@ class Everyone:
         return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
 
     def nearby(self, x: Array) -> Array:
-        away = (x - self.center[None, :]) / self.reach
-        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
-        return jnp.where(idle[:, None], x, self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far))
+        return jnp.where(idle[:, None], x, self.region.nearby(x))
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
@@ -280,8 +276,7 @@ def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool
     everyone = Everyone(
         links=ends,
         length=jnp.asarray(size.length),
-        center=jnp.asarray(size.center),
-        reach=jnp.asarray(size.reach),
+        region=Region.of(size),
         batches=prox.buckets(team, copies.rows, copies.count, convex),
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),

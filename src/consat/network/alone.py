@@ -1,0 +1,137 @@
+"""One agent's own objective and own ends of its links: what `consat.protocols` asks for, of a `Part` alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat import prox
+from consat.network.part import Part
+from consat.numerics import Groups
+from consat.objective import Nu, Objective
+from consat.scale import Region
+
+TOLERANCE = 1e-9
+"""Of the local step, relative; as in `consat.simulate.rounds`."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class OwnLinks:
+    """`consat.protocols.Links` of one agent.
+
+    Attributes:
+        row: (E,) the copy at each end.
+        groups: groups the ends by copy.
+        degree: (rows,).
+        metropolis: (E,).
+    """
+
+    row: Array
+    groups: Groups
+    degree: Array
+    metropolis: Array
+
+    @classmethod
+    def of(cls, part: Part) -> OwnLinks:
+        """The ends in the order of `ends`."""
+        index = {agent: row for row, agent in enumerate(part.team.ids)}
+        known = {neighbour.id: dict(zip(neighbour.shares, neighbour.degrees, strict=True)) for neighbour in part.neighbours}
+        pairs = ends(part)
+        row = np.array([index[agent] for _, agent in pairs], dtype=np.int32)
+        degree = np.bincount(row, minlength=part.team.count)
+        theirs = np.array([known[neighbour][agent] for neighbour, agent in pairs], dtype=float)
+        return cls(
+            jnp.asarray(row),
+            Groups.of(row, part.team.count),
+            jnp.asarray(degree, dtype=float),
+            jnp.asarray(1.0 / (1.0 + np.maximum(degree[row], theirs))),
+        )
+
+    def at(self, rows: Array) -> Array:
+        return rows[self.row]
+
+    def sum(self, links: Array) -> Array:
+        return self.groups.sum(links)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Alone:
+    """`consat.protocols.Solver` of one agent; what is one number an agent has shape (1,).
+
+    Attributes:
+        links: its ends of its links.
+        length: the team's unit of length.
+        region: where the team's places are.
+        batches: itself, if it has constraints.
+        nu: the smoothing.
+        local: its objective over the positions it holds.
+        talkers: all ends in one group.
+        me: its own row.
+        rows: how many positions it holds.
+        hops: see `Part`.
+        convex: see `Part`.
+    """
+
+    links: OwnLinks
+    length: Array
+    region: Region
+    batches: tuple[prox.Bucket, ...]
+    nu: Nu
+    local: Objective
+    talkers: Groups
+    me: int = field(metadata={"static": True})
+    rows: int = field(metadata={"static": True})
+    hops: int = field(metadata={"static": True})
+    convex: bool = field(metadata={"static": True})
+
+    @classmethod
+    def of(cls, part: Part) -> Alone:
+        """The solver of a part; its rows are in the order of `part.team.ids`."""
+        team = part.team
+        batches = prox.buckets(team, lambda _, position: position, team.count, part.concave)
+        return cls(
+            links=OwnLinks.of(part),
+            length=jnp.asarray(part.length),
+            region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
+            batches=tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in batches),
+            nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
+            local=Objective.at_positions(team),
+            talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
+            me=team.ids.index(part.me),
+            rows=team.count,
+            hops=part.hops,
+            convex=part.convex,
+        )
+
+    def recall(self, x: Array, kappa: Array) -> prox.Memory:
+        return prox.recall(self.batches, 1, self.nu, x, kappa)
+
+    def prox(
+        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[Array, prox.Memory, Array]:
+        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
+        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
+
+    def nearby(self, x: Array) -> Array:
+        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
+        return jnp.where(idle[:, None], x, self.region.nearby(x))
+
+    def margin(self, x: Array) -> Array:
+        return self.local.agent_margins(x)[self.me : self.me + 1]
+
+    def to_rows(self, numbers: Array) -> Array:
+        return jnp.broadcast_to(numbers, (self.rows,))
+
+    def least(self, numbers: Array) -> Array:
+        return -self.talkers.max(-numbers)
+
+
+def ends(part: Part) -> list[tuple[str, str]]:
+    """(neighbour, agent) for each end of a link: over which, and whose position; ordered by position, then by neighbour."""
+    return [(neighbour.id, agent) for agent in part.team.ids for neighbour in part.neighbours if agent in neighbour.shares]

@@ -1,0 +1,230 @@
+"""What an agent computes, apart from how its messages travel: a protocol, compiled for its own part.
+
+A core turns what has come since its last turn into its next state and what it says next: one row of numbers for each end of a link.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.network.alone import Alone, ends
+from consat.network.part import Part
+from consat.numerics import quick_compilation
+from consat.protocols import Rounds, agreement
+from consat.prox import Memory
+
+
+class Moment(NamedTuple):
+    """What a turn may ask about time.
+
+    Attributes:
+        round: which turn it is, from 0.
+        elapsed: since the last turn, s.
+        delay: (E,) how long messages take over each end, s.
+        fresh: (E,) whether the neighbour at the other end was heard lately.
+    """
+
+    round: float
+    elapsed: float
+    delay: np.ndarray
+    fresh: np.ndarray
+
+
+class Look(NamedTuple):
+    """What an agent sees of itself after a turn.
+
+    Attributes:
+        x: (rows, d) its estimates.
+        margin: ᾱ_i at them, +∞ without constraints.
+        known: for how many turns it has known that all are satisfied.
+    """
+
+    x: np.ndarray
+    margin: float
+    known: float
+
+
+class Core(Protocol):
+    """A protocol on one agent."""
+
+    @property
+    def part(self) -> Part:
+        """Whose."""
+        ...
+
+    @property
+    def ends(self) -> Sequence[tuple[str, str]]:
+        """(neighbour, agent) for each end; see `consat.network.alone.ends`."""
+        ...
+
+    @property
+    def width(self) -> int:
+        """How many numbers an end sends."""
+        ...
+
+    def begin(self, first: np.ndarray) -> Any:
+        """The state from first estimates, (rows, d)."""
+        ...
+
+    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
+        """Hear what arrived, (E, width), where `arrived`, (E,); take a step; the next state, and what to say, (E, width)."""
+        ...
+
+    def among(self, gone: Collection[str]) -> Core:
+        """The same protocol when these agents are not there."""
+        ...
+
+    def carry(self, other: Core, state: Any, first: np.ndarray) -> Any:
+        """The state that `state` of an `other` core becomes in this one; what is new begins from `first`, (rows, d)."""
+        ...
+
+
+class Kept(NamedTuple):
+    """Which rows and ends of another core live on: the index there, −1 where new."""
+
+    row: np.ndarray
+    link: np.ndarray
+
+    @classmethod
+    def of(cls, new: Core, old: Core) -> Kept:
+        rows = {agent: k for k, agent in enumerate(old.part.team.ids)}
+        links = {end: k for k, end in enumerate(old.ends)}
+        return cls(
+            np.array([rows.get(agent, -1) for agent in new.part.team.ids], dtype=int),
+            np.array([links.get(end, -1) for end in new.ends], dtype=int),
+        )
+
+    def merge(self, per: str | Mapping[str, Any], old: Any, fresh: Any) -> Any:
+        """`old` where it lives on, else `fresh`; `per` as in `consat.protocols.Rounds.per`."""
+        if isinstance(per, str):
+            index = {"row": self.row, "link": self.link}.get(per)
+            return old if index is None else jax.tree.map(functools.partial(_take, index), old, fresh)
+        return type(fresh)(**{name: self.merge(kind, getattr(old, name), getattr(fresh, name)) for name, kind in per.items()})
+
+
+def _take(index: np.ndarray, old: Array, fresh: Array) -> Array:
+    if not len(old) or not len(index):
+        return fresh
+    kept = (index >= 0).reshape(-1, *[1] * (np.ndim(fresh) - 1))
+    return jnp.where(kept, jnp.asarray(old)[np.maximum(index, 0)], fresh)
+
+
+class _Now(NamedTuple):
+    state: Any
+    ages: agreement.Ages
+
+
+_AGES: Mapping[str, str] = {"age": "agent", "heard": "link"}
+
+
+class RoundCore:
+    """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement`."""
+
+    def __init__(self, protocol: Rounds, whole: Part, gone: Collection[str] = ()) -> None:
+        self.protocol = protocol
+        self.whole = whole
+        self.part = whole.without(gone)
+        self.ends = ends(self.part)
+        self.solver = Alone.of(self.part)
+        self._begin, self._turn = _compiled()
+        self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
+        self.width = sum(self._layout.sizes) + 1
+
+    def begin(self, first: np.ndarray) -> _Now:
+        return self._begin(self.protocol, self.solver, first)
+
+    def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
+        now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived), moment.round)
+        return now, np.asarray(outbox), Look(np.asarray(x), float(margin[0]), float(known[0]))
+
+    def among(self, gone: Collection[str]) -> RoundCore:
+        return RoundCore(self.protocol, self.whole, gone)
+
+    def carry(self, other: Core, state: _Now, first: np.ndarray) -> _Now:
+        kept, fresh = Kept.of(self, other), self.begin(first)
+        return _Now(kept.merge(self.protocol.per, state.state, fresh.state), kept.merge(_AGES, state.ages, fresh.ages))
+
+
+class _Outline:
+    """A solver that gives what a true one gives, but for the values: enough to find the shape of a message, and quick to trace."""
+
+    def __init__(self, solver: Alone) -> None:
+        self.links, self.length, self.hops, self.convex = solver.links, solver.length, solver.hops, solver.convex
+        self.to_rows, self.least = solver.to_rows, solver.least
+
+    def nearby(self, x: Array) -> Array:
+        return x
+
+    def recall(self, x: Array, kappa: Array) -> Memory:
+        return Memory(jnp.zeros(1), jnp.ones(1))
+
+    def prox(
+        self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
+    ) -> tuple[Array, Memory, Array]:
+        return v, memory, kappa
+
+    def margin(self, x: Array) -> Array:
+        return jnp.zeros(1)
+
+
+class _Layout(NamedTuple):
+    """What a message consists of: its structure, and for each array the shape of what one end sends."""
+
+    structure: Any
+    shapes: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, protocol: Rounds, solver: Alone, dimension: int) -> _Layout:
+        """Found by tracing, not by running."""
+        first, outline = jax.ShapeDtypeStruct((solver.rows, dimension), float), _Outline(solver)
+
+        def message(x: Array) -> Any:
+            return protocol.speak(protocol.start(x, outline), outline, jnp.asarray(0.0), jnp.zeros(1))[1]
+
+        leaves, structure = jax.tree.flatten(jax.eval_shape(message, first))
+        return cls(structure, tuple(leaf.shape[1:] for leaf in leaves))
+
+    @property
+    def sizes(self) -> list[int]:
+        return [math.prod(shape) for shape in self.shapes]
+
+    def unpack(self, packed: Array) -> Any:
+        """(E, Σ sizes) → the message."""
+        stops = np.cumsum(self.sizes)
+        leaves = [
+            packed[:, stop - size : stop].reshape(len(packed), *shape)
+            for stop, size, shape in zip(stops, self.sizes, self.shapes, strict=True)
+        ]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
+    return _Now(protocol.start(first, solver), agreement.start(first, solver))
+
+
+def _turn(
+    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array], round_: Array
+) -> tuple[_Now, Array, Array, Array, Array]:
+    inbox, arrived = heard
+    state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
+    ages = agreement.hear(now.ages, inbox[:, -1], arrived)
+    state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))
+    ages, told = agreement.speak(ages, state.x, solver)
+    outbox = jnp.concatenate([*(leaf.reshape(len(inbox), -1) for leaf in jax.tree.leaves(message)), told[:, None]], axis=1)
+    return _Now(state, ages), outbox, state.x, solver.margin(state.x), agreement.known(ages, solver)
+
+
+@functools.cache
+def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Compiled once for all agents of the same shape."""
+    options = quick_compilation()
+    begin = jax.jit(_begin, static_argnames=("protocol",), compiler_options=options)
+    return begin, jax.jit(_turn, static_argnames=("protocol", "layout"), compiler_options=options)

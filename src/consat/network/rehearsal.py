@@ -1,0 +1,100 @@
+"""A whole team over the network in memory, agent by agent as each would run in its process, on a clock that only moves when all have done
+what is due: exact, repeatable, and as fast as the agents compute.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from consat.network.body import SimulatedBody
+from consat.network.modes import Manner, Runner, runner_of
+from consat.network.part import Part
+from consat.network.transports.memory import Air
+
+SHORTEST = 1e-6
+"""Time passes by at least this between two steps of an agent, s."""
+
+
+class Rehearsal:
+    """The agents of some parts.
+
+    Args:
+        parts: by agent.
+        manner: how they run.
+        air: the network between them.
+        speed: the most that a body moves, length/s.
+        build: makes the runner of an agent; what a process would make if None.
+    """
+
+    def __init__(
+        self,
+        parts: Mapping[str, Part],
+        manner: Manner,
+        air: Air,
+        *,
+        speed: float = np.inf,
+        build: Callable[..., Runner] = runner_of,
+    ) -> None:
+        self.parts, self.manner, self.air = parts, manner, air
+        self.events: list[dict[str, Any]] = []
+        self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
+        self.runners: dict[str, Runner] = {}
+        self._build, self._incarnations = build, dict.fromkeys(parts, 0)
+        self._due: list[tuple[float, str]] = []
+
+    def start(self, *agents: str, **changes: Any) -> None:
+        """Start agents, all if none is named, or start them again after a `kill`: what they remember is what is on disk.
+
+        Args:
+            *agents: their ids.
+            **changes: to their `Manner`.
+        """
+        for agent in agents or tuple(self.parts):
+            part = self.parts[agent]
+            self._incarnations[agent] += 1
+            manner = Manner(**({field: getattr(self.manner, field) for field in self.manner.__dataclass_fields__} | changes))
+            with jax.enable_x64(True):
+                self.runners[agent] = self._build(
+                    part, manner, self.air.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
+                    clock=self.air.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
+                )  # fmt: skip
+            heapq.heappush(self._due, (self.air.now, agent))
+
+    def kill(self, *agents: str) -> None:
+        """As a crash does: without a word."""
+        for agent in agents:
+            self.air.close(agent)
+            del self.runners[agent]
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Let time pass; whether `until`, looked at after every step, came true."""
+        end = self.air.now + seconds
+        with jax.enable_x64(True):
+            while (now := min(self.air.next(), self._due[0][0] if self._due else np.inf)) <= end:
+                self.air.now = max(now, self.air.now)
+                ready = self.air.deliver()
+                while self._due and self._due[0][0] <= self.air.now:
+                    ready.add(heapq.heappop(self._due)[1])
+                for agent in sorted(ready & self.runners.keys()):
+                    self._step(agent)
+                if until():
+                    return True
+        self.air.now = end
+        return until()
+
+    def _step(self, agent: str) -> None:
+        runner = self.runners[agent]
+        due = runner.step()
+        if runner.done:
+            self.kill(agent)
+            return
+        heapq.heappush(self._due, (max(due, self.air.now + SHORTEST), agent))
+
+    def positions(self) -> dict[str, np.ndarray]:
+        """Where the bodies are."""
+        return {agent: body.position().copy() for agent, body in self.bodies.items()}

@@ -1,0 +1,280 @@
+"""What every mode of talking shares: an agent's core, neighbours, membership, body and log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from consat.network.body import Body
+from consat.network.core import Core, Look
+from consat.network.membership import Membership
+from consat.network.part import Part
+from consat.network.peers import Peers
+from consat.network.transports import Transport
+from consat.network.wire import Expected, Kind, Message, Numbers
+
+SILENT: Final = 0.5
+"""A neighbour that was not heard for so long, s, counts as down."""
+REPORT: Final = 0.1
+"""Time between two reports, s."""
+LARGEST: Final = 1e150
+"""No number of a message is larger: its square must stay finite."""
+
+Log = Callable[[dict[str, Any]], None]
+
+
+class Station:
+    """One agent, whatever its mode.
+
+    Args:
+        part: the agent's own.
+        core: what it computes.
+        mode: the word for it; agents of another mode are not understood.
+        transport: over which it talks.
+        clock: own, s.
+        incarnation: larger after each restart.
+        body: sensor and actuator.
+        log: takes events, which are plain data.
+        frames: how many rounds a message carries.
+        stamped: whether it also carries the number of the round.
+        give_up: a neighbour silent for so long has left for good, s.
+        report: time between two reports, s.
+    """
+
+    def __init__(
+        self,
+        part: Part,
+        core: Core,
+        mode: str,
+        transport: Transport,
+        *,
+        clock: Callable[[], float],
+        incarnation: int,
+        body: Body,
+        log: Log,
+        frames: int = 1,
+        stamped: bool = False,
+        give_up: float = np.inf,
+        report: float = REPORT,
+    ) -> None:
+        self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
+        self.membership = Membership(part)
+        width = core.width
+        self.peers = Peers(
+            part,
+            part.problem(mode),
+            {neighbour.id: _expected(len(neighbour.shares), width, frames, stamped) for neighbour in part.neighbours},
+            transport,
+            clock,
+            incarnation,
+        )
+        self._log, self._give_up, self._period = log, give_up, report
+        self._born = clock()
+        self._track: list[list[float]] = []
+        self._satisfied = False
+        self._down = frozenset(self.peers.all)
+        self._next_report = clock()
+        self._gone: frozenset[str] = frozenset()
+        self.regroup(None, part.first)
+
+    # -- who is there ------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def present(self) -> list[str]:
+        """The neighbours that are there."""
+        return [neighbour.id for neighbour in self.core.part.neighbours]
+
+    def regroup(self, state: Any, first: np.ndarray) -> Any:
+        """Go on among those who are there: the core and the state for them. Nothing changes if nobody has come or gone."""
+        gone = self.membership.gone
+        if gone != self._gone:
+            for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
+                if state is not None and agents:
+                    self.log(event, agents=sorted(agents))
+            before, self.core = self.core, self.core.among(gone)
+            self._gone = gone
+            if state is not None:
+                state = self.core.carry(before, state, self.among(first))
+        place = {end: k for k, end in enumerate(self.core.ends)}
+        self._places = {
+            neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
+            for neighbour in self.part.neighbours
+        }
+        self._waiting = {neighbour: self.peers.all[neighbour] for neighbour in self.present}
+        return state
+
+    def among(self, first: np.ndarray) -> np.ndarray:
+        """The rows of `first`, of all agents of the part, that belong to those who are there."""
+        return first[[agent not in self._gone for agent in self.part.team.ids]]
+
+    @property
+    def changed(self) -> bool:
+        """Whether somebody has come or gone since the last `regroup`."""
+        return self.membership.gone != self._gone
+
+    def first(self) -> np.ndarray:
+        """(rows, d) first estimates of all agents of the part, its own position as measured."""
+        first = self.part.first.copy()
+        position = self.body.position()
+        if position is not None:
+            first[self.part.team.ids.index(self.part.me)] = position
+        return first
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether it knows that all are."""
+        return self._satisfied
+
+    # -- messages ----------------------------------------------------------------------------------------------------------------------
+
+    def hear(self) -> list[Message]:
+        """What came; news of who is there is taken in already."""
+        messages = self.peers.hear()
+        for message in messages:
+            if message.kind is not Kind.GOODBYE:
+                shares = self.peers.all[message.source].known.shares
+                epochs = message.arrays[0] if message.kind is Kind.HELLO else message.arrays[0][:, -1]
+                self.membership.hear(shares, epochs)
+        now = self.clock()
+        for neighbour in self.present:
+            peer = self.peers.all[neighbour]
+            if now - max(peer.heard, self._born) > self._give_up:
+                self.membership.drop(neighbour)
+        return messages
+
+    def blocks(self, outbox: np.ndarray) -> dict[str, np.ndarray]:
+        """What to tell each neighbour of the rows that the core says: (shares, width + 1), zeros for who is gone, then who is there."""
+        told = {}
+        for neighbour, place in self._places.items():
+            block = np.zeros((len(place), self.core.width + 1))
+            block[place >= 0, :-1] = outbox[place[place >= 0]]
+            block[:, -1] = self.membership.of(self.peers.all[neighbour].known.shares)
+            told[neighbour] = block
+        return told
+
+    def empty(self) -> tuple[np.ndarray, np.ndarray]:
+        """(E, width) and (E,): nothing has come."""
+        return np.zeros((len(self.core.ends), self.core.width)), np.zeros(len(self.core.ends), dtype=bool)
+
+    def sort(self, neighbour: str, block: np.ndarray, inbox: np.ndarray, arrived: np.ndarray) -> None:
+        """Put what a neighbour said into the rows of the ends, as far as both know the same agents to be there."""
+        place = self._places[neighbour]
+        agrees = (place >= 0) & (block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares))
+        inbox[place[agrees]] = block[agrees, :-1]
+        arrived[place[agrees]] = True
+
+    def greet(self) -> None:
+        """Say that one is there."""
+        for neighbour in self._listeners():
+            self.peers.say(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
+
+    def say(self, arrays: Mapping[str, list[np.ndarray]], to: list[str] | None = None) -> None:
+        """Send the state to all neighbours that are there, or to some."""
+        for neighbour in self._listeners() if to is None else to:
+            self.peers.say(neighbour, Kind.STATE, arrays[neighbour])
+
+    def goodbye(self) -> None:
+        """Say that one stops; whoever leaves for good says so in its state before."""
+        for neighbour in self._listeners():
+            self.peers.say(neighbour, Kind.GOODBYE, [])
+
+    def _listeners(self) -> list[str]:
+        """The neighbours that are there, and those who are not, but speak: they may not know."""
+        now = self.clock()
+        return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
+
+    # -- time --------------------------------------------------------------------------------------------------------------------------
+
+    def delays(self) -> np.ndarray:
+        """(E,) half the round trip to the neighbour of each end, s; 0 before it is known."""
+        trips = {neighbour: np.nan_to_num(peer.trip) for neighbour, peer in self.peers.all.items()}
+        return np.array([0.5 * trips[neighbour] for neighbour, _ in self.core.ends])
+
+    def fresh(self, within: float) -> np.ndarray:
+        """(E,) whether the neighbour of each end was heard within so many s."""
+        now = self.clock()
+        return np.array([now - self.peers.all[neighbour].heard <= within for neighbour, _ in self.core.ends], dtype=bool)
+
+    # -- the log -----------------------------------------------------------------------------------------------------------------------
+
+    def log(self, event: str, **details: Any) -> None:
+        """One event."""
+        self._log({"event": event, "id": self.part.me, "t": self.clock(), **details})
+
+    def move(self, look: Look, stamp: float) -> None:
+        """Let the body follow the estimate, and tell what there is to tell.
+
+        Args:
+            look: of the last turn.
+            stamp: round or time, of the track.
+        """
+        target = look.x[self.core.part.team.ids.index(self.part.me)]
+        self.velocity = self.body.follow(target, self.clock())
+        position = self.body.position()
+        if position is not None:
+            self._track.append([stamp, *position.tolist()])
+        self._look = look
+        if (look.known > 0) != self._satisfied:
+            self._satisfied = look.known > 0
+            self.log("satisfied" if self._satisfied else "unsatisfied", stamp=stamp)
+
+    _look: Look | None = None
+    velocity: np.ndarray | None = None
+
+    def watch(self) -> float:
+        """Log who went down or came up, and a report when one is due; when the next is."""
+        now = self.clock()
+        alive = self.peers.alive()
+        down = frozenset(
+            neighbour
+            for neighbour, peer in self.peers.all.items()
+            if neighbour not in self._gone and (now - peer.heard > SILENT or neighbour not in alive)
+        )
+        for neighbour in sorted(down ^ self._down):
+            if neighbour not in self._gone:
+                self.log("down" if neighbour in down else "up", peer=neighbour)
+        self._down = down
+        if now >= self._next_report:
+            self.report()
+            self._next_report = max(self._next_report + self._period, now)
+        return self._next_report
+
+    def report(self) -> None:
+        """How things stand, and where the body was since the last report."""
+        look, position = self._look, self.body.position()
+        peers = {}
+        for neighbour, peer in self.peers.all.items():
+            if neighbour not in self._gone:
+                trip = None if np.isnan(peer.trip) else round(peer.trip, 6)
+                peers[neighbour] = {
+                    "up": neighbour not in self._down, "silent": _number(round(self.clock() - peer.heard, 4)),
+                    "loss": round(peer.lost, 4), "trip": trip,
+                }  # fmt: skip
+        self.log(
+            "report",
+            position=None if position is None else position.tolist(),
+            margin=None if look is None else _number(look.margin),
+            known=None if look is None else look.known,
+            track=self._track,
+            peers=peers,
+            sent=dict(self.peers.sent),
+            dropped=self.peers.dropped,
+        )
+        self._track = []
+
+
+def _number(value: float) -> float | None:
+    """For JSON, which knows no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _expected(shares: int, width: int, frames: int, stamped: bool) -> Expected:
+    """What messages of a neighbour hold. A margin may be infinite: of an agent without constraints."""
+    frame = Numbers((shares, width + 1), np.inf)
+    return {
+        Kind.HELLO: [(shares,)],
+        Kind.STATE: [*[frame] * frames, *[(1,)] * stamped],
+        Kind.GOODBYE: [],
+    }
