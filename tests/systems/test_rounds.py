@@ -89,7 +89,7 @@ def _against_recursion(protocol: Any, mix: Callable[[np.ndarray, np.ndarray], np
     team = teams.case("c")
     copies, nu = Estimates.of(team, "local"), Nu(5.0, 5.0)
     first = np.random.default_rng(5).uniform(-4, 4, (copies.count, 2))
-    trace = simulate_rounds(team, protocol, copies, nu, 1.0, first, convex=True, rounds=30, stop="never")
+    trace = simulate_rounds(team, protocol, copies, nu, scale(team), first, convex=True, rounds=30, stop="never")
     everyone = world_of(team, copies, nu, scale(team), convex=True, weather=Weather(), body=None).everyone
     adjacency = np.zeros((copies.count, copies.count))
     adjacency[tuple(copies.edges.T)] = 1.0

@@ -248,7 +248,8 @@ def simulate_flow(
             tally.add(sink, choice, times[1:], seen, float(moved))
             heard = told(progress, times[-1] / end, tally.margin)
             if not fine:
-                found: Ending | None = "too stiff" if bool(_finite(state)) else "diverged"
+                sound = _finite(state) & _finite(rate(flow, problem, times[-1], state))
+                found: Ending | None = "too stiff" if bool(sound) else "diverged"
             else:
                 found = _ending(tally, stop, schedule, state.x[observer.own], infeasible)
             if found is None and (stopped() or not heard):
