@@ -171,6 +171,9 @@ def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
             throw=False,
         )
         (seen, moved), last = solution.ys
+        # moments that the integration did not reach are filled with ∞, which would be a margin to be proud of
+        lost = jnp.isinf(moved)
+        seen = jax.tree.map(lambda leaf: jnp.where(lost.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf), seen)
         return seen, jax.tree.map(lambda leaf: leaf[-1], last), solution.result == diffrax.RESULTS.successful, jnp.max(moved)
 
     return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
