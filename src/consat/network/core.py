@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import Rounds, agreement
 from consat.prox import Memory
+
+LARGEST: Final = 1e100
+"""No number that agents send is larger, margins apart, as none in a scenario is: squares stay finite."""
 
 
 class Moment(NamedTuple):
@@ -68,6 +71,11 @@ class Core(Protocol):
     @property
     def width(self) -> int:
         """How many numbers an end sends."""
+        ...
+
+    @property
+    def largest(self) -> np.ndarray:
+        """(width,) the largest magnitude that each of them may have."""
         ...
 
     def begin(self, first: np.ndarray) -> Any:
@@ -137,6 +145,8 @@ class RoundCore:
         self._begin, self._turn = _compiled()
         self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self._layout.sizes) + 1
+        # A single number may be a margin, which is infinite of an agent without constraints.
+        self.largest = np.array([*(LARGEST if shape else np.inf for shape, size in self._layout.each for _ in range(size)), LARGEST])
 
     def begin(self, first: np.ndarray) -> _Now:
         return self._begin(self.protocol, self.solver, first)
@@ -192,6 +202,11 @@ class _Layout(NamedTuple):
     @property
     def sizes(self) -> list[int]:
         return [math.prod(shape) for shape in self.shapes]
+
+    @property
+    def each(self) -> Iterator[tuple[tuple[int, ...], int]]:
+        """Shape and size of each array."""
+        return zip(self.shapes, self.sizes, strict=True)
 
     def unpack(self, packed: Array) -> Any:
         """(E, Σ sizes) → the message."""

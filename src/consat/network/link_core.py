@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.alone import Alone, ends
-from consat.network.core import Core, Kept, Look, Moment
+from consat.network.core import LARGEST, Core, Kept, Look, Moment
 from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import agreement
@@ -84,6 +84,7 @@ class LinkCore:
         self.ends = ends(self.part)
         self.solver = Alone.of(self.part)
         self.width = 2 * self.part.team.dimension + 2
+        self.largest = np.full(self.width, LARGEST)
         self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray) -> LinkState:

@@ -122,7 +122,7 @@ class Lockstep:
             if (block := self._blocks.get((neighbour, self._round - 1))) is not None:
                 station.sort(neighbour, block, inbox, arrived)
         moment = Moment(float(self._round), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
-        self._state, outbox, look = station.core.turn(self._state, inbox, arrived, moment)
+        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
         self._began = now
@@ -169,7 +169,7 @@ class Lockstep:
         else:  # somebody joined, to whom nothing was said yet
             inbox, nothing = station.empty()
             moment = Moment(self._round - 1.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
-            self._state, outbox, _ = station.core.turn(self._state, inbox, nothing, moment)
+            self._state, outbox, _ = station.turn(self._state, inbox, nothing, moment)
             self._outbox = outbox, outbox
         self._save()
         self._speak(station.clock())

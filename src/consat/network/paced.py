@@ -98,7 +98,7 @@ class Paced:
             station.sort(neighbour, block, inbox, arrived)
         self._latest.clear()
         moment = Moment(float(self._count), now - self._last, station.delays(), station.fresh(self._stale))
-        self._state, outbox, look = station.core.turn(self._state, inbox, arrived, moment)
+        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1
         station.say({neighbour: [block] for neighbour, block in station.blocks(outbox).items()})
