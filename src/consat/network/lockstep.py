@@ -18,7 +18,7 @@ from consat.network.core import Moment
 from consat.network.paced import FAREWELLS
 from consat.network.persistence import Store
 from consat.network.station import Station
-from consat.network.wire import Kind
+from consat.network.wire import SUPPORT, Kind
 
 RESEND: Final = 0.006
 """Whoever waits repeats itself after so long, s."""
@@ -39,8 +39,10 @@ class Lockstep:
         self.done = False
         self._turns, self._period = turns, 0.0 if rate is None else 1.0 / rate
         self._round = 0  # so many are spoken
+        self._regrouped = 0  # so many were, when somebody last came or went: a protocol begins anew then
         self._said: dict[str, list[np.ndarray]] = {}
-        self._blocks: dict[tuple[str, int], np.ndarray] = {}
+        self._blocks: dict[str, dict[int, np.ndarray]] = {neighbour: {} for neighbour in station.peers.all}
+        self._rumours: dict[str, tuple[int, int]] = {}
         self._reached: dict[str, int] = {}
         self._lacking: set[str] = set()
         self._spoke = -np.inf
@@ -90,12 +92,22 @@ class Lockstep:
             elif message.kind is Kind.STATE:
                 current, previous, number = message.arrays
                 reached = int(number[0])
+                if reached > self._round and not self._confirmed(message.source, reached):
+                    continue
                 if reached == self._reached.get(message.source):
                     self._lacking.add(message.source)  # it says again what it has said: it waits
                 self._reached[message.source] = reached
-                for round_, block in ((reached, current), (reached - 1, previous)):
-                    if round_ >= self._round - 1:
-                        self._blocks[message.source, round_] = block
+                blocks = self._blocks[message.source]
+                due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
+                self._blocks[message.source] = due | {reached: current, reached - 1: previous}
+
+    def _confirmed(self, neighbour: str, reached: int) -> bool:
+        """Whether a neighbour that is farther on than it can be, while this agent remembers, has said so several times on end: one
+        mistaken or forged number must not lead this agent into a round that nobody else will ever reach."""
+        before, times = self._rumours.get(neighbour, (reached, 0))
+        times = times + 1 if 0 <= reached - before <= 1 else 1
+        self._rumours[neighbour] = reached, times
+        return times >= SUPPORT
 
     def _ready(self) -> bool:
         if self._turns is not None and self._round >= self._turns:
@@ -104,7 +116,7 @@ class Lockstep:
 
     def _heard(self, neighbour: str) -> bool:
         """Whether a neighbour has nothing more to say about the round before: it was heard, or is too far on to repeat that."""
-        return (neighbour, self._round - 1) in self._blocks or self._reached.get(neighbour, 0) > self._round
+        return self._round - 1 in self._blocks[neighbour] or self._reached.get(neighbour, 0) > self._round
 
     def _catch_up(self) -> None:
         """A neighbour can be one round ahead. If one is farther, this agent has lost its memory, or has just joined: it goes where the
@@ -119,14 +131,13 @@ class Lockstep:
         station = self.station
         inbox, arrived = station.empty()
         for neighbour in station.present:
-            if (block := self._blocks.get((neighbour, self._round - 1))) is not None:
+            if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.sort(neighbour, block, inbox, arrived)
-        moment = Moment(float(self._round), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
+        moment = Moment(float(self._round - self._regrouped), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
         self._began = now
-        self._blocks = {key: block for key, block in self._blocks.items() if key[1] >= self._round - 1}
         self._save()
         self._speak(now)
         station.move(look, float(self._round))
@@ -160,6 +171,7 @@ class Lockstep:
         station = self.station
         before = station.core
         self._state = station.regroup(self._state, station.first())
+        self._regrouped = self._round
         if self._outbox is None:
             return
         place = {end: k for k, end in enumerate(before.ends)}
@@ -168,7 +180,7 @@ class Lockstep:
             self._outbox = self._outbox[0][rows], self._outbox[1][rows]
         else:  # somebody joined, to whom nothing was said yet
             inbox, nothing = station.empty()
-            moment = Moment(self._round - 1.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
+            moment = Moment(0.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, moment)
             self._outbox = outbox, outbox
         self._save()
