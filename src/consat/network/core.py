@@ -130,9 +130,6 @@ class _Now(NamedTuple):
     ages: agreement.Ages
 
 
-_AGES: Mapping[str, str] = {"age": "agent", "heard": "link"}
-
-
 class RoundCore:
     """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement`."""
 
@@ -153,14 +150,14 @@ class RoundCore:
 
     def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
         now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived), moment.round)
-        return now, np.asarray(outbox), Look(np.asarray(x), float(margin[0]), float(known[0]))
+        return now, np.asarray(outbox), Look(np.asarray(x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
 
     def among(self, gone: Collection[str]) -> RoundCore:
         return RoundCore(self.protocol, self.whole, gone)
 
     def carry(self, other: Core, state: _Now, first: np.ndarray) -> _Now:
-        kept, fresh = Kept.of(self, other), self.begin(first)
-        return _Now(kept.merge(self.protocol.per, state.state, fresh.state), kept.merge(_AGES, state.ages, fresh.ages))
+        """Only the estimates live on: the rest has settled on a problem that is no more, what is known of its satisfaction included."""
+        return self.begin(np.asarray(Kept.of(self, other).merge("row", state.state.x, first)))
 
 
 class _Outline:
@@ -230,7 +227,10 @@ def _turn(
     ages = agreement.hear(now.ages, inbox[:, -1], arrived)
     state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))
     ages, told = agreement.speak(ages, state.x, solver)
-    outbox = jnp.concatenate([*(leaf.reshape(len(inbox), -1) for leaf in jax.tree.leaves(message)), told[:, None]], axis=1)
+    outbox = jnp.concatenate(
+        [*(leaf.reshape(len(inbox), size) for leaf, size in zip(jax.tree.leaves(message), layout.sizes, strict=True)), told[:, None]],
+        axis=1,
+    )
     return _Now(state, ages), outbox, state.x, solver.margin(state.x), agreement.known(ages, solver)
 
 

@@ -93,13 +93,15 @@ class LinkCore:
     def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, Look]:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
         state, outbox, margin, known = self._turn(self.solver, gains, state, inbox, arrived, moment)
-        return state, np.asarray(outbox), Look(np.asarray(state.x), float(margin[0]), float(known[0]))
+        return state, np.asarray(outbox), Look(np.asarray(state.x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
 
     def among(self, gone: Collection[str]) -> LinkCore:
         return LinkCore(self.whole, self.k1, self.k2, gone)
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray) -> LinkState:
-        return Kept.of(self, other).merge(_PER, state, self.begin(first))
+        """All that belongs to ends that live on does, but what is known of satisfaction is of a problem that is no more."""
+        fresh = self.begin(first)
+        return Kept.of(self, other).merge(_PER, state, fresh)._replace(ages=fresh.ages)
 
 
 def _begin(solver: Alone, first: Array) -> LinkState:
