@@ -130,7 +130,7 @@ class Lockstep:
     def _turn(self, now: float) -> None:
         station = self.station
         inbox, arrived = station.empty()
-        for neighbour in station.present:
+        for neighbour in station.present if self._round else ():  # there is no round before the first
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.sort(neighbour, block, inbox, arrived)
         moment = Moment(float(self._round - self._regrouped), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))

@@ -15,6 +15,8 @@ from consat.network.modes import Manner, Runner, runner_of
 from consat.network.part import Part
 from consat.network.transports.memory import Air
 
+OPENING = 0.01
+"""Between opening its transport and its first step an agent has so long to get messages, s."""
 SHORTEST = 1e-6
 """Time passes by at least this between two steps of an agent, s."""
 
@@ -62,7 +64,7 @@ class Rehearsal:
                     part, manner, self.air.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
                     clock=self.air.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
                 )  # fmt: skip
-            self._due[agent] = self.air.now
+            self._due[agent] = self.air.now + OPENING
 
     def kill(self, *agents: str) -> None:
         """As a crash does: without a word."""
