@@ -21,7 +21,10 @@ from consat.network.station import Station
 from consat.network.wire import SUPPORT, Kind
 
 RESEND: Final = 0.006
-"""Whoever waits repeats itself after so long, s."""
+"""Whoever waits repeats itself after so long, s, or after `USUAL` times as long as rounds take at best; then after twice as long …"""
+USUAL: Final = 4.0
+SELDOM: Final = 0.2
+"""… up to this: where rounds are slow because the machine is busy, more messages would only make it busier."""
 
 
 class Lockstep:
@@ -46,6 +49,7 @@ class Lockstep:
         self._reached: dict[str, int] = {}
         self._lacking: set[str] = set()
         self._spoke = -np.inf
+        self._patience = self._usual = RESEND
         self._began = -np.inf
         self._farewells = 0
         self._outbox: tuple[np.ndarray, np.ndarray] | None = None
@@ -78,12 +82,12 @@ class Lockstep:
             self._catch_up()
             if self._ready() and now - self._began >= self._period:
                 self._turn(now)
-            elif now - self._spoke >= RESEND:
+            elif now - self._spoke >= self._patience:
                 self._repeat(now)
         due = station.watch()
         if self._ready() and self._state is not None:
             return min(due, self._began + self._period)
-        return min(due, self._spoke + RESEND)
+        return min(due, self._spoke + self._patience)
 
     def _hear(self) -> None:
         for message in self.station.hear():
@@ -137,6 +141,8 @@ class Lockstep:
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
+        self._usual = min(now - self._began, 1.05 * self._usual, SELDOM)
+        self._patience = max(RESEND, min(USUAL * self._usual, SELDOM))
         self._began = now
         self._save()
         self._speak(now)
@@ -161,6 +167,7 @@ class Lockstep:
         over = self._turns is not None and self._round >= self._turns
         to = [neighbour for neighbour in station.present if not over or neighbour in self._lacking]
         self._spoke = now
+        self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
         if self._said and to:
             station.say(self._said, to)
