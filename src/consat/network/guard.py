@@ -1,7 +1,8 @@
 """A turn that ends in numbers which are none is not taken: the messages that led there are.
 
 A message may be well-formed and still be poison, from a neighbour that diverges or lies: an absurd number turns an agent's state into NaN,
-from which no later message frees it. From any finite state the protocols find their way once the neighbour speaks sense again.
+from which no later message frees it. From any sensible state the protocols find their way once the neighbour speaks sense again; an agent
+whose state leads nowhere, whatever it listens to, begins anew.
 """
 
 from __future__ import annotations
@@ -22,18 +23,20 @@ class Turn(NamedTuple):
         outbox: (E, width) what to say.
         look: what the agent sees of itself.
         refused: the neighbours whose messages were left out.
+        anew: whether the state was given up.
     """
 
     state: Any
     outbox: np.ndarray
     look: Look
     refused: tuple[str, ...] = ()
+    anew: bool = False
 
 
 def turn(core: Core, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> Turn:
     """Take a turn, see `Core.turn`, without those neighbours whose messages spoil it."""
     whole = Turn(*core.turn(state, inbox, arrived, moment))
-    if not arrived.any() or _sound(state, whole):
+    if _sound(state, whole):
         return whole
     kept, refused = np.zeros_like(arrived), []
     for neighbour in dict.fromkeys(neighbour for neighbour, _ in core.ends):
@@ -44,7 +47,12 @@ def turn(core: Core, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment:
             kept = kept | its
         else:
             refused.append(neighbour)
-    return Turn(*core.turn(state, np.where(kept[:, None], inbox, 0.0), kept, moment), refused=tuple(refused))
+    heard = np.where(kept[:, None], inbox, 0.0), kept
+    rest = Turn(*core.turn(state, *heard, moment), refused=tuple(refused))
+    if _sound(state, rest):
+        return rest
+    fresh = core.begin(core.part.first)
+    return Turn(*core.turn(fresh, np.zeros_like(inbox), np.zeros_like(arrived), moment), refused=tuple(refused), anew=True)
 
 
 def _sound(before: Any, after: Turn) -> bool:

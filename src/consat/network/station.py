@@ -164,10 +164,12 @@ class Station:
         arrived[place[agrees]] = True
 
     def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
-        """See `Core.turn`; a neighbour whose message would make the state infinite is not listened to in this turn."""
+        """See `Core.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
             self.log("refused", peer=neighbour)
+        if done.anew:
+            self.log("anew")
         return done.state, done.outbox, done.look
 
     def greet(self) -> None:
