@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,11 @@ from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import Rounds, agreement
 from consat.prox import Memory
+
+LARGEST: Final = 1e100
+"""No number that agents send is larger, margins apart, as none in a scenario is: squares stay finite."""
+PENALTY: Final = 200.0
+"""No |ln ρ| is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes."""
 
 
 class Moment(NamedTuple):
@@ -68,6 +73,11 @@ class Core(Protocol):
     @property
     def width(self) -> int:
         """How many numbers an end sends."""
+        ...
+
+    @property
+    def largest(self) -> np.ndarray:
+        """(width,) the largest magnitude that each of them may have."""
         ...
 
     def begin(self, first: np.ndarray) -> Any:
@@ -122,9 +132,6 @@ class _Now(NamedTuple):
     ages: agreement.Ages
 
 
-_AGES: Mapping[str, str] = {"age": "agent", "heard": "link"}
-
-
 class RoundCore:
     """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement`."""
 
@@ -137,20 +144,23 @@ class RoundCore:
         self._begin, self._turn = _compiled()
         self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self._layout.sizes) + 1
+        # A single number is ln ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
+        single = PENALTY + 2.0 * abs(math.log(whole.length)) if protocol.name == "admm" else np.inf
+        self.largest = np.array([*(LARGEST if shape else single for shape, size in self._layout.each for _ in range(size)), LARGEST])
 
     def begin(self, first: np.ndarray) -> _Now:
         return self._begin(self.protocol, self.solver, first)
 
     def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
         now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived), moment.round)
-        return now, np.asarray(outbox), Look(np.asarray(x), float(margin[0]), float(known[0]))
+        return now, np.asarray(outbox), Look(np.asarray(x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
 
     def among(self, gone: Collection[str]) -> RoundCore:
         return RoundCore(self.protocol, self.whole, gone)
 
     def carry(self, other: Core, state: _Now, first: np.ndarray) -> _Now:
-        kept, fresh = Kept.of(self, other), self.begin(first)
-        return _Now(kept.merge(self.protocol.per, state.state, fresh.state), kept.merge(_AGES, state.ages, fresh.ages))
+        """Only the estimates live on: the rest has settled on a problem that is no more, what is known of its satisfaction included."""
+        return self.begin(np.asarray(Kept.of(self, other).merge("row", state.state.x, first)))
 
 
 class _Outline:
@@ -196,6 +206,11 @@ class _Layout(NamedTuple):
     def sizes(self) -> list[int]:
         return [math.prod(shape) for shape in self.shapes]
 
+    @property
+    def each(self) -> Iterator[tuple[tuple[int, ...], int]]:
+        """Shape and size of each array."""
+        return zip(self.shapes, self.sizes, strict=True)
+
     def unpack(self, packed: Array) -> Any:
         """(E, Σ sizes) → the message."""
         stops = np.cumsum(self.sizes)
@@ -218,7 +233,10 @@ def _turn(
     ages = agreement.hear(now.ages, inbox[:, -1], arrived)
     state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))
     ages, told = agreement.speak(ages, state.x, solver)
-    outbox = jnp.concatenate([*(leaf.reshape(len(inbox), -1) for leaf in jax.tree.leaves(message)), told[:, None]], axis=1)
+    outbox = jnp.concatenate(
+        [*(leaf.reshape(len(inbox), size) for leaf, size in zip(jax.tree.leaves(message), layout.sizes, strict=True)), told[:, None]],
+        axis=1,
+    )
     return _Now(state, ages), outbox, state.x, solver.margin(state.x), agreement.known(ages, solver)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.alone import Alone, ends
-from consat.network.core import Core, Kept, Look, Moment
+from consat.network.core import LARGEST, Core, Kept, Look, Moment
 from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import agreement
@@ -84,6 +84,7 @@ class LinkCore:
         self.ends = ends(self.part)
         self.solver = Alone.of(self.part)
         self.width = 2 * self.part.team.dimension + 2
+        self.largest = np.full(self.width, LARGEST)
         self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray) -> LinkState:
@@ -92,13 +93,15 @@ class LinkCore:
     def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, Look]:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
         state, outbox, margin, known = self._turn(self.solver, gains, state, inbox, arrived, moment)
-        return state, np.asarray(outbox), Look(np.asarray(state.x), float(margin[0]), float(known[0]))
+        return state, np.asarray(outbox), Look(np.asarray(state.x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
 
     def among(self, gone: Collection[str]) -> LinkCore:
         return LinkCore(self.whole, self.k1, self.k2, gone)
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray) -> LinkState:
-        return Kept.of(self, other).merge(_PER, state, self.begin(first))
+        """All that belongs to ends that live on does, but what is known of satisfaction is of a problem that is no more."""
+        fresh = self.begin(first)
+        return Kept.of(self, other).merge(_PER, state, fresh)._replace(ages=fresh.ages)
 
 
 def _begin(solver: Alone, first: Array) -> LinkState:

@@ -18,10 +18,13 @@ from consat.network.core import Moment
 from consat.network.paced import FAREWELLS
 from consat.network.persistence import Store
 from consat.network.station import Station
-from consat.network.wire import Kind
+from consat.network.wire import SUPPORT, Kind
 
 RESEND: Final = 0.006
-"""Whoever waits repeats itself after so long, s."""
+"""Whoever waits repeats itself after so long, s, or after `USUAL` times as long as rounds take at best; then after twice as long …"""
+USUAL: Final = 4.0
+SELDOM: Final = 0.2
+"""… up to this: where rounds are slow because the machine is busy, more messages would only make it busier."""
 
 
 class Lockstep:
@@ -39,11 +42,14 @@ class Lockstep:
         self.done = False
         self._turns, self._period = turns, 0.0 if rate is None else 1.0 / rate
         self._round = 0  # so many are spoken
+        self._regrouped = 0  # so many were, when somebody last came or went: a protocol begins anew then
         self._said: dict[str, list[np.ndarray]] = {}
-        self._blocks: dict[tuple[str, int], np.ndarray] = {}
+        self._blocks: dict[str, dict[int, np.ndarray]] = {neighbour: {} for neighbour in station.peers.all}
+        self._rumours: dict[str, tuple[int, int]] = {}
         self._reached: dict[str, int] = {}
         self._lacking: set[str] = set()
         self._spoke = -np.inf
+        self._patience = self._usual = RESEND
         self._began = -np.inf
         self._farewells = 0
         self._outbox: tuple[np.ndarray, np.ndarray] | None = None
@@ -76,12 +82,12 @@ class Lockstep:
             self._catch_up()
             if self._ready() and now - self._began >= self._period:
                 self._turn(now)
-            elif now - self._spoke >= RESEND:
+            elif now - self._spoke >= self._patience:
                 self._repeat(now)
         due = station.watch()
         if self._ready() and self._state is not None:
             return min(due, self._began + self._period)
-        return min(due, self._spoke + RESEND)
+        return min(due, self._spoke + self._patience)
 
     def _hear(self) -> None:
         for message in self.station.hear():
@@ -90,12 +96,22 @@ class Lockstep:
             elif message.kind is Kind.STATE:
                 current, previous, number = message.arrays
                 reached = int(number[0])
+                if reached > self._round and not self._confirmed(message.source, reached):
+                    continue
                 if reached == self._reached.get(message.source):
                     self._lacking.add(message.source)  # it says again what it has said: it waits
                 self._reached[message.source] = reached
-                for round_, block in ((reached, current), (reached - 1, previous)):
-                    if round_ >= self._round - 1:
-                        self._blocks[message.source, round_] = block
+                blocks = self._blocks[message.source]
+                due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
+                self._blocks[message.source] = due | {reached: current, reached - 1: previous}
+
+    def _confirmed(self, neighbour: str, reached: int) -> bool:
+        """Whether a neighbour that is farther on than it can be, while this agent remembers, has said so several times on end: one
+        mistaken or forged number must not lead this agent into a round that nobody else will ever reach."""
+        before, times = self._rumours.get(neighbour, (reached, 0))
+        times = times + 1 if 0 <= reached - before <= 1 else 1
+        self._rumours[neighbour] = reached, times
+        return times >= SUPPORT
 
     def _ready(self) -> bool:
         if self._turns is not None and self._round >= self._turns:
@@ -104,7 +120,7 @@ class Lockstep:
 
     def _heard(self, neighbour: str) -> bool:
         """Whether a neighbour has nothing more to say about the round before: it was heard, or is too far on to repeat that."""
-        return (neighbour, self._round - 1) in self._blocks or self._reached.get(neighbour, 0) > self._round
+        return self._round - 1 in self._blocks[neighbour] or self._reached.get(neighbour, 0) > self._round
 
     def _catch_up(self) -> None:
         """A neighbour can be one round ahead. If one is farther, this agent has lost its memory, or has just joined: it goes where the
@@ -118,15 +134,16 @@ class Lockstep:
     def _turn(self, now: float) -> None:
         station = self.station
         inbox, arrived = station.empty()
-        for neighbour in station.present:
-            if (block := self._blocks.get((neighbour, self._round - 1))) is not None:
+        for neighbour in station.present if self._round else ():  # there is no round before the first
+            if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.sort(neighbour, block, inbox, arrived)
-        moment = Moment(float(self._round), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
-        self._state, outbox, look = station.core.turn(self._state, inbox, arrived, moment)
+        moment = Moment(float(self._round - self._regrouped), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
+        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
+        self._usual = min(now - self._began, 1.05 * self._usual, SELDOM)
+        self._patience = max(RESEND, min(USUAL * self._usual, SELDOM))
         self._began = now
-        self._blocks = {key: block for key, block in self._blocks.items() if key[1] >= self._round - 1}
         self._save()
         self._speak(now)
         station.move(look, float(self._round))
@@ -150,6 +167,7 @@ class Lockstep:
         over = self._turns is not None and self._round >= self._turns
         to = [neighbour for neighbour in station.present if not over or neighbour in self._lacking]
         self._spoke = now
+        self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
         if self._said and to:
             station.say(self._said, to)
@@ -160,6 +178,7 @@ class Lockstep:
         station = self.station
         before = station.core
         self._state = station.regroup(self._state, station.first())
+        self._regrouped = self._round
         if self._outbox is None:
             return
         place = {end: k for k, end in enumerate(before.ends)}
@@ -168,8 +187,8 @@ class Lockstep:
             self._outbox = self._outbox[0][rows], self._outbox[1][rows]
         else:  # somebody joined, to whom nothing was said yet
             inbox, nothing = station.empty()
-            moment = Moment(self._round - 1.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
-            self._state, outbox, _ = station.core.turn(self._state, inbox, nothing, moment)
+            moment = Moment(0.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
+            self._state, outbox, _ = station.turn(self._state, inbox, nothing, moment)
             self._outbox = outbox, outbox
         self._save()
         self._speak(station.clock())

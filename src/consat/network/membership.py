@@ -12,7 +12,7 @@ import numpy as np
 from consat.network.part import Part
 
 MOST = 2.0**31
-"""A number beyond is not believed."""
+"""A number beyond is not believed. It is even: whoever is said to have left, and has not, can always answer with a larger number."""
 
 
 class Membership:
@@ -44,7 +44,7 @@ class Membership:
         """
         news = False
         for agent, told in zip(agents, epochs, strict=True):
-            if not (0 <= told < MOST and told == int(told)) or told <= self._epoch[agent]:
+            if not (0 <= told <= MOST and told == int(told)) or told <= self._epoch[agent]:
                 continue
             if agent != self._me:
                 self._epoch[agent] = int(told)

@@ -38,7 +38,7 @@ class Paced:
         self._period, self._turns, self._stale = 1.0 / rate, turns, max(stale, 3.0 / rate)
         self._latest: dict[str, np.ndarray] = {}
         self._state: Any = None
-        self._count = 0
+        self._count = self._regrouped = 0
         self._due = self._last = station.clock()
         self._begun = False
         self._first_heard: float | None = None
@@ -93,12 +93,13 @@ class Paced:
         station = self.station
         if station.changed:
             self._state = station.regroup(self._state, station.first())
+            self._regrouped = self._count
         inbox, arrived = station.empty()
         for neighbour, block in self._latest.items():
             station.sort(neighbour, block, inbox, arrived)
         self._latest.clear()
-        moment = Moment(float(self._count), now - self._last, station.delays(), station.fresh(self._stale))
-        self._state, outbox, look = station.core.turn(self._state, inbox, arrived, moment)
+        moment = Moment(float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale))
+        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1
         station.say({neighbour: [block] for neighbour, block in station.blocks(outbox).items()})

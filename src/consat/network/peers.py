@@ -22,6 +22,7 @@ class Peer:
 
     Attributes:
         known: what the part says of it.
+        born: when this agent began, own clock; it has sent nothing before.
         sequence: of the last message sent to it.
         last: the last message accepted from it.
         heard: when that was, own clock; −∞ if never.
@@ -31,6 +32,7 @@ class Peer:
     """
 
     known: Neighbour
+    born: float = -np.inf
     sequence: int = 0
     last: Message | None = None
     heard: float = -np.inf
@@ -43,8 +45,9 @@ class Peer:
         if self.last is not None and self.last.incarnation == message.incarnation and message.sequence > self.last.sequence:
             gap = message.sequence - self.last.sequence
             self.lost += (1.0 - (1.0 - SMOOTH) ** gap) * ((gap - 1) / gap - self.lost)
-        if np.isfinite(message.echo):
-            trip = max(now - message.echo, 0.0)
+        # An echo of what was never sent is a mistake or a lie, and would spoil the mean for long.
+        if self.born <= message.echo <= now:
+            trip = now - message.echo
             self.trip = trip if np.isnan(self.trip) else self.trip + SMOOTH * (trip - self.trip)
         self.last, self.heard = message, now
 
@@ -70,7 +73,7 @@ class Peers:
         clock: Callable[[], float],
         incarnation: int,
     ) -> None:
-        self.all = {neighbour.id: Peer(neighbour) for neighbour in part.neighbours}
+        self.all = {neighbour.id: Peer(neighbour, clock()) for neighbour in part.neighbours}
         self.sent = Counter[str]()
         self._part, self._problem, self._transport, self._clock, self._incarnation = part, problem, transport, clock, incarnation
         self._checker = Checker(part.me, expected, problem, clock=clock)

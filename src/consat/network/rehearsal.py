@@ -4,7 +4,6 @@ what is due: exact, repeatable, and as fast as the agents compute.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,6 +15,8 @@ from consat.network.modes import Manner, Runner, runner_of
 from consat.network.part import Part
 from consat.network.transports.memory import Air
 
+OPENING = 0.01
+"""Between opening its transport and its first step an agent has so long to get messages, s."""
 SHORTEST = 1e-6
 """Time passes by at least this between two steps of an agent, s."""
 
@@ -45,7 +46,7 @@ class Rehearsal:
         self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
         self._build, self._incarnations = build, dict.fromkeys(parts, 0)
-        self._due: list[tuple[float, str]] = []
+        self._due: dict[str, float] = {}
 
     def start(self, *agents: str, **changes: Any) -> None:
         """Start agents, all if none is named, or start them again after a `kill`: what they remember is what is on disk.
@@ -63,24 +64,23 @@ class Rehearsal:
                     part, manner, self.air.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
                     clock=self.air.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
                 )  # fmt: skip
-            heapq.heappush(self._due, (self.air.now, agent))
+            self._due[agent] = self.air.now + OPENING
 
     def kill(self, *agents: str) -> None:
         """As a crash does: without a word."""
         for agent in agents:
             self.air.close(agent)
-            del self.runners[agent]
+            del self.runners[agent], self._due[agent]
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Let time pass; whether `until`, looked at after every step, came true."""
         end = self.air.now + seconds
         with jax.enable_x64(True):
-            while (now := min(self.air.next(), self._due[0][0] if self._due else np.inf)) <= end:
+            while (now := min(self.air.next(), *self._due.values(), np.inf)) <= end:
                 self.air.now = max(now, self.air.now)
-                ready = self.air.deliver()
-                while self._due and self._due[0][0] <= self.air.now:
-                    ready.add(heapq.heappop(self._due)[1])
-                for agent in sorted(ready & self.runners.keys()):
+                ready = self.air.deliver() & self.runners.keys()
+                ready |= {agent for agent, due in self._due.items() if due <= self.air.now}
+                for agent in sorted(ready):
                     self._step(agent)
                 if until():
                     return True
@@ -93,7 +93,7 @@ class Rehearsal:
         if runner.done:
             self.kill(agent)
             return
-        heapq.heappush(self._due, (max(due, self.air.now + SHORTEST), agent))
+        self._due[agent] = max(due, self.air.now + SHORTEST)
 
     def positions(self) -> dict[str, np.ndarray]:
         """Where the bodies are."""

@@ -7,8 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from consat.network import guard
 from consat.network.body import Body
-from consat.network.core import Core, Look
+from consat.network.core import LARGEST, Core, Look, Moment
 from consat.network.membership import Membership
 from consat.network.part import Part
 from consat.network.peers import Peers
@@ -19,8 +20,6 @@ SILENT: Final = 0.5
 """A neighbour that was not heard for so long, s, counts as down."""
 REPORT: Final = 0.1
 """Time between two reports, s."""
-LARGEST: Final = 1e150
-"""No number of a message is larger: its square must stay finite."""
 
 Log = Callable[[dict[str, Any]], None]
 
@@ -40,7 +39,7 @@ class Station:
         frames: how many rounds a message carries.
         stamped: whether it also carries the number of the round.
         give_up: a neighbour silent for so long has left for good, s.
-        report: time between two reports, s.
+        report: time between two reports, s; 0 reports after each turn.
     """
 
     def __init__(
@@ -61,11 +60,10 @@ class Station:
     ) -> None:
         self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
         self.membership = Membership(part)
-        width = core.width
         self.peers = Peers(
             part,
             part.problem(mode),
-            {neighbour.id: _expected(len(neighbour.shares), width, frames, stamped) for neighbour in part.neighbours},
+            {neighbour.id: _expected(len(neighbour.shares), core.largest, frames, stamped) for neighbour in part.neighbours},
             transport,
             clock,
             incarnation,
@@ -165,6 +163,15 @@ class Station:
         inbox[place[agrees]] = block[agrees, :-1]
         arrived[place[agrees]] = True
 
+    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
+        """See `Core.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
+        done = guard.turn(self.core, state, inbox, arrived, moment)
+        for neighbour in done.refused:
+            self.log("refused", peer=neighbour)
+        if done.anew:
+            self.log("anew")
+        return done.state, done.outbox, done.look
+
     def greet(self) -> None:
         """Say that one is there."""
         for neighbour in self._listeners():
@@ -219,6 +226,8 @@ class Station:
         if (look.known > 0) != self._satisfied:
             self._satisfied = look.known > 0
             self.log("satisfied" if self._satisfied else "unsatisfied", stamp=stamp)
+        if self._period <= 0:
+            self.report()
 
     _look: Look | None = None
     velocity: np.ndarray | None = None
@@ -236,6 +245,8 @@ class Station:
             if neighbour not in self._gone:
                 self.log("down" if neighbour in down else "up", peer=neighbour)
         self._down = down
+        if self._period <= 0:
+            return now + SILENT
         if now >= self._next_report:
             self.report()
             self._next_report = max(self._next_report + self._period, now)
@@ -270,9 +281,9 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _expected(shares: int, width: int, frames: int, stamped: bool) -> Expected:
-    """What messages of a neighbour hold. A margin may be infinite: of an agent without constraints."""
-    frame = Numbers((shares, width + 1), np.inf)
+def _expected(shares: int, largest: np.ndarray, frames: int, stamped: bool) -> Expected:
+    """What messages of a neighbour hold; the last number of each row tells who is there."""
+    frame = Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST))
     return {
         Kind.HELLO: [(shares,)],
         Kind.STATE: [*[frame] * frames, *[(1,)] * stamped],

@@ -1,0 +1,203 @@
+"""Agents as processes over zenoh on loopback. Few, for each takes seconds to start; `test_rehearsal.py` has the many."""
+
+import functools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from consat.network.fleet import Event, Fleet, free_ports
+from consat.network.part import Part, split
+from consat.scenario import load
+from tests.networked.case_c import GOAL
+from tests.networked.oracle import ROUNDS
+
+ROOT = Path(__file__).parents[2]
+CONSAT = [sys.executable, "-c", "from consat.cli import main; main()"]
+START = 90.0
+"""A process has so long to start, s, on a busy machine."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """All agents here share what they compile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("xla")))
+        yield
+
+
+def parts() -> dict[str, Part]:
+    ports = free_ports(3)
+    addresses = {agent: f"tcp/127.0.0.1:{port}" for agent, port in zip(GOAL, ports, strict=True)}
+    return split(load("case-c"), run=f"test-{os.getpid()}-{ports[0]}", addresses=addresses)
+
+
+def listen(fleet: Fleet, heard: list[Event], until: Callable[[], bool], seconds: float) -> None:
+    """Listen until something has come true, which must be within `seconds`."""
+    end = time.monotonic() + seconds
+    while not until():
+        assert time.monotonic() < end, f"too late; the last events were {heard[-3:]}"
+        heard += fleet.poll(0.02)
+
+
+def last(heard: list[Event], agent: str, kind: str = "report") -> Event | None:
+    return next((event for event in reversed(heard) if event["id"] == agent and event["event"] == kind), None)
+
+
+def reached(heard: list[Event], round_: int) -> bool:
+    """Whether some agent has told of a round as late."""
+    return any(event["event"] == "report" and event["track"] and event["track"][-1][0] >= round_ for event in heard)
+
+
+def off(heard: list[Event]) -> float:
+    """How far the team is from its optimum, as last reported."""
+    reports = {agent: last(heard, agent) for agent in GOAL}
+    return max(
+        np.inf if report is None else np.abs(np.subtract(report["position"], GOAL[agent])).max() for agent, report in reports.items()
+    )
+
+
+def test_launch_gathers_a_result_as_any_run() -> None:
+    done = subprocess.run(
+        [*CONSAT, "launch", "case-c", "--loss", "0.3", "--json"], capture_output=True, text=True, timeout=START, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["schema"] == "consat.run/1"
+    assert (result["status"], result["verdict"], result["ending"]) == ("satisfied", "feasible", "settled")
+    for agent, goal in GOAL.items():
+        np.testing.assert_allclose(result["positions"][agent], goal, atol=1e-3)
+    assert result["network"]["loss"] == pytest.approx(0.3, abs=0.2)
+    assert 0 < result["network"]["known_from"] < result["time"]
+    assert result["satisfied_from"]["time"] <= result["network"]["known_from"] + 0.1  # who knows is right, up to a sample
+
+
+@pytest.fixture(scope="module")
+def truth() -> dict[str, np.ndarray]:
+    """(T, d) of each agent, as `simulate` has it when every product is rounded by itself."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_cpu_max_isa=AVX", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.networked.oracle", "truth"], cwd=ROOT, env=environment, capture_output=True, timeout=START, check=True
+    )
+    told = json.loads(done.stdout)
+    return dict(zip(told["ids"], np.array(told["truth"]).swapaxes(0, 1), strict=True))
+
+
+@pytest.mark.parametrize(("loss", "kills"), [(0.0, ()), (0.3, ("a2", "a1"))], ids=["perfect", "loss-and-kills"])
+def test_lockstep_equals_simulate_bit_for_bit(loss: float, kills: tuple[str, ...], truth: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """Also when two agents are ended by SIGKILL on the way, and start again from what they have on disk."""
+    options = ["--mode", "lockstep", "--rounds", str(ROUNDS), "--loss", str(loss), "--report", "0", "--rate", "50"]
+    heard: list[Event] = []
+    with Fleet(parts(), options, exact=True) as fleet:
+
+        def start(agent: str) -> None:
+            fleet.start(agent, "--memory", str(tmp_path / agent), "--seed", str(ord(agent[-1])))
+
+        for agent in GOAL:
+            start(agent)
+        for number, agent in enumerate(kills, 1):
+            listen(fleet, heard, functools.partial(reached, heard, 30 * number), START)
+            fleet.kill(agent)
+            start(agent)
+        listen(fleet, heard, lambda: all(last(heard, agent, "finished") for agent in GOAL), START)
+    resumed = [event["id"] for event in heard if event["event"] == "resumed"]
+    assert resumed == list(kills)
+    for agent, positions in truth.items():
+        track = {int(number): place for e in heard if e["id"] == agent and e["event"] == "report" for number, *place in e["track"]}
+        assert len(track) >= ROUNDS - len(kills)  # a round may be taken and not told of before the end
+        assert ROUNDS in track
+        assert max(np.abs(positions[number] - place).max() for number, place in track.items()) == 0.0
+
+
+def test_a_crash_is_noticed_at_once_and_mended_without_memory() -> None:
+    heard: list[Event] = []
+    with Fleet(parts(), ["--loss", "0.3"]) as fleet:
+        for agent in GOAL:
+            fleet.start(agent)
+        listen(fleet, heard, lambda: off(heard) < 1e-3, START)
+        fleet.kill("a2")
+        killed = time.monotonic()
+        listen(fleet, heard, lambda: all((e := last(heard, a, "down")) and e["t"] >= killed - 0.1 for a in ("a1", "a3")), 10.0)
+        noticed = max(event["t"] for event in heard if event["event"] == "down" and event["peer"] == "a2")
+        assert noticed - killed < 1.0
+        fleet.start("a2", "--position", "5,5")
+        listen(fleet, heard, lambda: (e := last(heard, "a2")) is not None and e["t"] > killed and off(heard) > 1.0, START)
+        listen(fleet, heard, lambda: off(heard) < 1e-3, START)
+
+
+def test_an_agent_told_to_leave_goes_and_the_others_stay() -> None:
+    heard: list[Event] = []
+    with Fleet(parts(), ["--mode", "admm"]) as fleet:
+        for agent in GOAL:
+            fleet.start(agent)
+        listen(fleet, heard, lambda: off(heard) < 1e-3, START)
+        fleet.tell("a3", {"command": "leave"})
+        listen(fleet, heard, lambda: last(heard, "a3", "end") is not None and last(heard, "a2", "left") is not None, 30.0)
+        listen(fleet, heard, lambda: np.abs(np.subtract(last(heard, "a1")["position"], [2, 0])).max() < 1e-3, 30.0)  # type: ignore[index]
+        assert not fleet.running("a3") or fleet.exit_code("a3") in {None, 0}
+
+
+def children(pid: int) -> list[int]:
+    return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+
+
+def test_ctrl_c_stops_launch_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    command = [*CONSAT, "launch", "case-c", "--until", "600", "--json"]
+    with (tmp_path / "out").open("wb") as out, subprocess.Popen(command, stdout=out) as launch:
+        try:
+            end = time.monotonic() + START
+            while len(children(launch.pid)) < 3 or not any(map(_listens, children(launch.pid))):
+                assert time.monotonic() < end
+                time.sleep(0.1)
+            agents = children(launch.pid)
+            launch.send_signal(signal.SIGINT)
+            assert launch.wait(30.0) == 130
+        finally:
+            launch.kill()
+    assert json.loads((tmp_path / "out").read_text())["ending"] == "interrupted"
+    assert not [pid for pid in agents if Path(f"/proc/{pid}").exists()]
+
+
+def _listens(pid: int) -> bool:
+    """Whether a process has got as far as zenoh's threads."""
+    return len(list(Path(f"/proc/{pid}/task").iterdir())) > 6
+
+
+SOLO = """
+consat: 1
+agents:
+  - {id: solo, start: [3, 1], constraints: [{kind: within, center: [0, 0], radius: 1}]}
+"""
+
+
+def test_an_agent_follows_its_sensor_under_its_speed_limit(tmp_path: Path) -> None:
+    """Its position is measured by somebody else, here on the way from (3, 4) to the centre of the disc; it commands velocities."""
+    (tmp_path / "solo.yaml").write_text(SOLO)
+    port = str(free_ports(1)[0])
+    command = [*CONSAT, "agent", str(tmp_path / "solo.yaml"), "--id", "solo", "--sensor", "stdin", "--speed", "0.5", "--port", port]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as agent:
+        try:
+            assert agent.stdin is not None
+            assert agent.stdout is not None
+            agent.stdin.write('what is this\n{"position": [3, NaN]}\n{"position": [3, 4]}\n')
+            agent.stdin.flush()
+            events: list[dict[str, Any]] = []
+            for line in agent.stdout:
+                events.append(json.loads(line))
+                if events[-1]["event"] == "command" and np.linalg.norm(events[-1]["velocity"]) > 0.4:
+                    break
+            agent.stdin.write('{"command": "stop"}\n')
+            agent.stdin.close()
+            assert agent.wait(30.0) == 0
+        finally:
+            agent.kill()
+    assert {event["line"] for event in events if event["event"] == "rejected"} == {"what is this", '{"position": [3, NaN]}'}
+    np.testing.assert_allclose(events[-1]["velocity"], [-0.3, -0.4], atol=0.02)  # towards the disc, no faster than allowed
