@@ -156,7 +156,7 @@ def test_every_reason_is_tested() -> None:
 
 
 def test_a_name_must_not_run_into_the_checksum() -> None:
-    """Found by the millionth mutated message: the checksum's first byte may be the missing last letter of the name."""
+    """Found by fuzzing: the checksum's first byte may be the missing last letter of the name."""
     bodies = (encode(message(kind=Kind.HELLO, arrays=(), sequence=sequence))[:-5] for sequence in range(10_000))
     payload = next(payload for body in bodies if (payload := sealed(body))[-4:-3] == b"2")
     door = checker()
