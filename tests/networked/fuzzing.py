@@ -83,6 +83,8 @@ def second_opinion(payload: bytes) -> Read | None:
     if crc(payload[:-4]) != _integer(payload[-4:]):
         return None
     long, far = _integer(payload[64:66]), _integer(payload[66:68])
+    if 68 + long + far > len(payload) - 4:
+        return None
     source, destination, rest = payload[68 : 68 + long], payload[68 + long : 68 + long + far], payload[68 + long + far : -4]
     known = {name.encode(): name for name in EXPECTED}
     if source not in known or destination != ME.encode() or payload[5] not in EXPECTED[known[source]]:

@@ -149,7 +149,7 @@ def children(pid: int) -> list[int]:
     return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
 
 
-def test_ctrl_c_stops_launch_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_launch_mends_what_crashes_and_ctrl_c_leaves_nothing_behind(tmp_path: Path) -> None:
     command = [*CONSAT, "launch", "case-c", "--until", "600", "--json"]
     with (tmp_path / "out").open("wb") as out, subprocess.Popen(command, stdout=out) as launch:
         try:
@@ -158,6 +158,11 @@ def test_ctrl_c_stops_launch_and_leaves_nothing_behind(tmp_path: Path) -> None:
                 assert time.monotonic() < end
                 time.sleep(0.1)
             agents = children(launch.pid)
+            os.kill(agents[0], signal.SIGKILL)
+            while len(agents) < 4:
+                assert time.monotonic() < end
+                agents += [pid for pid in children(launch.pid) if pid not in agents]
+                time.sleep(0.05)
             launch.send_signal(signal.SIGINT)
             assert launch.wait(30.0) == 130
         finally:

@@ -25,7 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consat.errors import NetworkError
-from consat.network import keys
+from consat.network import commands, keys
 from consat.network.keys_command import keys as keys_command
 from consat.network.names import spelled
 from consat.network.transports import zenoh as transport
@@ -463,6 +463,24 @@ def test_command_makes_keys_of_a_scenario_and_of_ids(tmp_path: Path) -> None:
     assert run(keys_command, ["a4", "--out", str(tmp_path / "k"), "--replace"]).exit_code == 0
     assert run(keys_command, ["--out", str(tmp_path / "k")]).exit_code == 2
     assert run(keys_command, ["a", "b", "--set", "count=2", "--out", str(tmp_path / "k")]).exit_code == 2
+
+
+def test_keys_beside_the_scenario_are_used_and_must_be_complete(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nobody goes unprotected because a key is missing."""
+    file = tmp_path / "team.yaml"
+    file.touch()
+    assert commands._keys(None, str(file), ["a", "b"]) is None
+    assert commands._keys(None, "case-c", ["a1"]) is None, "a packaged scenario has no folder"
+    keys.make(["a", "b"], tmp_path / "keys")
+    assert commands._keys(None, str(file), ["a", "b"]) == tmp_path / "keys"
+    assert "links are protected" in capsys.readouterr().err
+    with pytest.raises(NetworkError, match=r"there are keys in .*keys, but none of 'c'; make them"):
+        commands._keys(None, str(file), ["a", "b", "c"])
+    own = tmp_path / "robot"
+    shutil.copytree(tmp_path / "keys" / "b", own / "keys")
+    shutil.copy(file, own)
+    assert commands._keys(None, str(own / "team.yaml"), ["b"]) == own / "keys"
+    assert keys.load(own / "keys", "b").key == own / "keys" / "key.pem"
 
 
 def test_commands_of_the_documentation_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -155,6 +155,15 @@ def test_every_reason_is_tested() -> None:
     assert {reason for _, reason in BAD.values()} == set(Reason) - {Reason.DUPLICATE, Reason.STALE, Reason.JUMP}
 
 
+def test_a_name_must_not_run_into_the_checksum() -> None:
+    """Found by fuzzing: the checksum's first byte may be the missing last letter of the name."""
+    bodies = (encode(message(kind=Kind.HELLO, arrays=(), sequence=sequence))[:-5] for sequence in range(10_000))
+    payload = next(payload for body in bodies if (payload := sealed(body))[-4:-3] == b"2")
+    door = checker()
+    assert door.accept(payload) is None
+    assert door.counts == {Reason.SHAPE: 1}
+
+
 def test_infinity_passes_where_it_is_due() -> None:
     door = checker()
     assert door.accept(encode(message(source="a3", arrays=(np.zeros((1, 2)), np.array([math.inf, -math.inf]))))) is not None

@@ -38,8 +38,8 @@ def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: 
     worst = f", margin {min(margins):+.4g}" if margins else ""
     known = ", all know that all are satisfied" if observer.all_known() is not None else ""
     drawn = Table(title=f"{title}: {seconds:.1f} s{worst}{known}", title_justify="left")
-    for column in ("agent", "state", "margin", "turns/s", "loss", "round trip", "does not hear"):
-        drawn.add_column(column, justify="left" if column in ("agent", "state", "does not hear") else "right")
+    for column in ("agent", "state", "margin", "turns/s", "loss", "round trip", "deaf to"):
+        drawn.add_column(column, justify="left" if column in ("agent", "state", "deaf to") else "right")
     for agent, seen in observer.seen.items():
         up = running.get(agent, False)
         peers = seen.report["peers"] if seen.report else {}
@@ -63,7 +63,7 @@ def _state(seen: Seen, *, up: bool) -> str:
         return "ended" if seen.ended is not None else "down"
     if seen.report is None:
         return "starting"
-    return "knows all satisfied" if seen.known is not None else "running" if seen.stamps else "waiting"
+    return "satisfied" if seen.known is not None else "running" if seen.stamps else "waiting"
 
 
 def _rate(seen: Seen) -> float:

@@ -258,13 +258,20 @@ def _part(file: str, agent: str, overrides: tuple[str, ...], port: int) -> Part:
 
 
 def _keys(given: Path | None, file: str, agents: Any) -> Path | None:
-    """The folder of the keys: as given, or the one beside FILE if it has keys of all these agents."""
+    """The folder of the keys: as given, or the one beside FILE. Where there are some, no agent goes without."""
+    from consat.errors import NetworkError
+    from consat.network.keys import CA, KEY
     from consat.network.names import spelled
 
     if given is not None:
         return given
     beside = Path(file).parent / "keys"
-    found = Path(file).is_file() and all((beside / spelled(agent)).is_dir() for agent in agents)
-    if found:
-        click.echo(f"links are protected by the keys in {beside}", err=True)
-    return beside if found else None
+    if not (Path(file).is_file() and (beside / CA).is_file()):
+        return None
+    own = len(agents) == 1 and (beside / KEY).is_file()  # the folder of that one agent, not of the team
+    if lacking := [repr(agent) for agent in agents if not own and not (beside / spelled(agent)).is_dir()]:
+        raise NetworkError(
+            f"there are keys in {beside}, but none of {', '.join(lacking)}; make them (consat keys … --out {beside}), or say --keys"
+        )
+    click.echo(f"links are protected by the keys in {beside}", err=True)
+    return beside

@@ -72,9 +72,9 @@ class Fleet:
         self._selector.close()
         self._folder.cleanup()
 
-    def file(self, agent: str) -> Path:
-        """The private file of an agent, readable by its owner alone."""
-        return Path(self._folder.name) / f"{spelled(agent)}.yaml"
+    def file(self, agent: str, ending: str = "yaml") -> Path:
+        """The private file of an agent, or another of its own, in a folder that only this user can read."""
+        return Path(self._folder.name) / f"{spelled(agent)}.{ending}"
 
     def start(self, agent: str, *options: str) -> None:
         """Start an agent, or start it again; `options` of its own come after the common ones."""

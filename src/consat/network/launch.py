@@ -110,9 +110,11 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     observer = Observer(team, starts, "round" if plan.mode == "lockstep" else "time")
     began = time.monotonic()
     with Fleet(parts, plan.options(), exact=plan.mode == "lockstep") as fleet:
-        for number, agent in enumerate(team.ids):
-            fleet.start(agent, "--seed", str(settings.start.seed * team.count + number))
-        ending = _watch(fleet, observer, plan, _rules(parts, plan, size.length), f"{scenario.name}, {plan.mode}", quiet=quiet)
+        for agent in team.ids:
+            _start(fleet, observer, plan, agent, settings.start.seed)
+        ending = _watch(
+            fleet, observer, plan, _rules(parts, plan, size.length), _Watch(f"{scenario.name}, {plan.mode}", quiet, settings.start.seed)
+        )
         up = _up(observer, began)
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
@@ -146,18 +148,47 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
     return _Rules(window + ROUND_TRIPS * plan.delay[1], SETTLED * length, -np.inf)
 
 
-def _watch(fleet: Fleet, observer: Observer, plan: Plan, rules: _Rules, title: str, *, quiet: bool) -> Ending:
-    """Until the team is to be stopped; why. `Plan.until` counts from when all agents have begun."""
+@dataclass(frozen=True)
+class _Watch:
+    """How a team is watched: title of the table, whether there is none, and the seed of agents that start anew."""
+
+    title: str
+    quiet: bool
+    seed: int
+
+
+def _start(fleet: Fleet, observer: Observer, plan: Plan, agent: str, seed: int) -> None:
+    """Start an agent, or start it again where its body was last seen; in lockstep from what it has on disk."""
+    ids = list(observer.team.ids)
+    own = ["--seed", str(seed * len(ids) + ids.index(agent))]
+    if observer.seen[agent].places:
+        own += ["--position", ",".join(map(repr, observer.seen[agent].places[-1]))]
+    if plan.mode == "lockstep":
+        own += ["--memory", str(fleet.file(agent, "state"))]
+    fleet.start(agent, *own)
+
+
+def _mend(fleet: Fleet, observer: Observer, plan: Plan, seed: int) -> None:
+    """Start those again that a signal has ended. Raises: NetworkError: one has failed by itself, and would again."""
+    for agent in observer.team.ids:
+        code = fleet.exit_code(agent) or 0
+        if code > 0:
+            raise NetworkError(f"the process of agent {agent!r} ended with exit code {code}")
+        if code < 0:
+            _start(fleet, observer, plan, agent, seed)
+
+
+def _watch(fleet: Fleet, observer: Observer, plan: Plan, rules: _Rules, watch: _Watch) -> Ending:
+    """Until the team is to be stopped; why. `Plan.until` counts from when all agents have begun. Who crashes is started again."""
     began = time.monotonic()
     end = None if plan.until is not None else began + PATIENCE
     agents = observer.team.ids
     try:
-        with board(title, quiet=quiet) as draw:
+        with board(watch.title, quiet=watch.quiet) as draw:
             while end is None or time.monotonic() < end:
                 observer.take(fleet.poll(0.05))
                 draw(observer, {agent: fleet.running(agent) for agent in agents}, time.monotonic() - began)
-                if failed := [agent for agent in agents if fleet.exit_code(agent)]:
-                    raise NetworkError(f"the process of agent {failed[0]!r} ended with exit code {fleet.exit_code(failed[0])}")
+                _mend(fleet, observer, plan, watch.seed)
                 if not np.isfinite(observer.positions()).all():
                     return "diverged"
                 if plan.rounds is not None and all(seen.finished or seen.ended for seen in observer.seen.values()):

@@ -138,11 +138,9 @@ def _transport(part: Part, manner: Manner, around: Circumstances) -> Iterator[Tr
     from consat.network.transports.zenoh import connect
 
     credentials = None if around.keys is None else keys.load(around.keys, part.me)
-    scheme = "tcp" if credentials is None else "tls"
-    addresses = {neighbour.id: _over(scheme, neighbour.address) for neighbour in part.neighbours}
-    transport = connect(
-        part.run, part.me, _over(scheme, part.listen), addresses, reliable=manner.reliable, credentials=credentials
-    )  # fmt: skip
+    listen, *others = (_protected(address) if credentials else address for address in (part.listen, *(n.address for n in part.neighbours)))
+    addresses = {neighbour.id: address for neighbour, address in zip(part.neighbours, others, strict=True)}
+    transport = connect(part.run, part.me, listen, addresses, reliable=manner.reliable, credentials=credentials)
     try:
         if around.loss > 0 or around.delay[1] > 0:
             yield Weathered(transport, time.monotonic, loss=around.loss, delay=around.delay, seed=around.seed)
@@ -152,10 +150,10 @@ def _transport(part: Part, manner: Manner, around: Circumstances) -> Iterator[Tr
         transport.close()
 
 
-def _over(scheme: str, address: str) -> str:
-    """The address with encryption where there are keys, and without where there are none."""
+def _protected(address: str) -> str:
+    """The address with encryption. One that has it keeps it also where there are no keys: then nobody listens rather than in the clear."""
     kind, _, rest = address.partition("/")
-    return f"{scheme}/{rest}" if kind in ("tcp", "tls") else address
+    return f"tls/{rest}" if kind == "tcp" else address
 
 
 def _write(event: dict[str, Any]) -> None:
