@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from consat.runner import resume, run, solve
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
+    from consat.sweeping import Sweep, sweep
     from consat.team import Agent, Team
 
 _HOME = {
@@ -29,14 +30,16 @@ _HOME = {
     "runner": ("resume", "run", "solve"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
+    "sweeping": ("Sweep", "sweep"),
     "team": ("Agent", "Team"),
 }  # fmt: skip
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
     "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
-    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Team", "apart", "box", "constraint",
-    "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "near", "outside", "resume", "run", "solve", "within",
+    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Sweep", "Team", "apart", "box",
+    "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "near", "outside", "resume", "run", "solve",
+    "sweep", "within",
 ]  # fmt: skip
 
 

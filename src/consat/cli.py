@@ -204,6 +204,53 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 
 
 @cli.command()
+@scenario_argument
+@set_option
+@click.option(
+    "--over", multiple=True, metavar="PATH=VALUES", help="Values to try, v1,v2,… or FROM:TO:COUNT; a path as in --set, loss or sleep."
+)
+@click.option("--seeds", type=click.IntRange(min=1), default=1, metavar="COUNT", help="How many seeds for each combination of values.")
+@click.option("--seed", type=click.IntRange(min=0), help="The first of them; start.seed if not given.")
+@click.option("--protocol", metavar="KIND", help="As for run, as is all that follows.")
+@click.option("--estimates", type=click.Choice(["local", "full"]))
+@click.option("--rounds", type=click.IntRange(min=0))
+@click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS")
+@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]))
+@click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0)
+@click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0)
+@click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write sweep.json, sweep.csv and a figure there."
+)
+@click.option("--full", is_flag=True, help="List every run in the JSON, however many.")
+@json_option
+def sweep(
+    scenario: str, overrides: tuple[str, ...], over: tuple[str, ...], seed: int | None, out: Path | None, as_json: bool, **settings: Any
+) -> int:  # fmt: skip
+    """Run many seeds, and every combination of some values, as one computation."""
+    _cache_compilations()
+    if wrong := [text for text in over if not all(text.partition("="))]:
+        raise click.UsageError(
+            f"--over {wrong[0]}: this must be PATH=VALUES, such as loss=0,0.1,0.3 or agents.a1.constraints.0.radius=0.5:2:16"
+        )
+    loaded = _load(scenario, (*overrides, *([] if seed is None else [f"start.seed={seed}"])))
+    from consat.sweeping import sweep as sweep_team
+    from consat.sweeping import values
+    from consat.views import tables
+
+    options = {path.strip(): values(text) for path, _, text in (each.partition("=") for each in over)}
+    with _progress(as_json, share=True) as progress, _located(loaded):
+        found = sweep_team(loaded, options, progress=progress, **settings)
+    if out is not None:
+        _say(f"written: {', '.join(map(str, found.save(out)))}")
+    if as_json:
+        click.echo(json.dumps(found.summary))
+    else:
+        _show(tables.sweep(found.summary))
+    return DONE if all(group["success"] == 1 for group in found.summary["groups"]) else UNSATISFIED
+
+
+@cli.command()
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Where to; beside the result if not given.")
 def plot(result: Path, out: Path | None) -> None:
@@ -259,7 +306,7 @@ def _cache_compilations() -> None:
 
 
 @contextmanager
-def _progress(quiet: bool, total: float | None = None) -> Iterator[Callable[[float, float | None], None]]:
+def _progress(quiet: bool, total: float | None = None, *, share: bool = False) -> Iterator[Callable[[float, float | None], None]]:
     """A bar on stderr, where that is a terminal; with its rate, if it is known of how many rounds, or seconds of a flow, it tells."""
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
@@ -279,7 +326,8 @@ def _progress(quiet: bool, total: float | None = None) -> Iterator[Callable[[flo
             since, before = first[0]
             per_second = (done - before) * (total or PATIENCE) / max(time.perf_counter() - since, 1e-9)
             rate = f"{per_second:,.0f}/s   " if margin is not None and done > before else ""
-            bar.update(task, completed=done, said="" if margin is None else f"{rate}margin {margin:+.4g}")
+            said = "" if margin is None else f"{margin:.0%} satisfied" if share else f"{rate}margin {margin:+.4g}"
+            bar.update(task, completed=done, said=said)
 
         yield update
 

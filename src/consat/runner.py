@@ -23,7 +23,7 @@ from consat.quadratics import shape_of
 from consat.result import Result
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load, loads
-from consat.settings import ProtocolSettings, Settings, Smoothing, Start
+from consat.settings import Settings, Smoothing, Start
 from consat.simulate import Stop
 from consat.simulate import checkpoint as checkpoints
 from consat.simulate.files import RESULT, Files
@@ -110,7 +110,7 @@ def run(
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
     files = None if out is None else Files(Path(out), checkpoint)
-    return _start(_scenario(team), given, files, full, progress)
+    return _start(scenario_of(team), given, files, full, progress)
 
 
 def resume(
@@ -144,7 +144,7 @@ def resume(
         given["smoothing"] = Smoothing.model_validate(given["smoothing"])
     if team is None and not about["scenario"]:
         raise InvalidSettings(f"{out}: the team of this run holds Python functions; give resume the same team")
-    scenario = _scenario(team) if team is not None else loads(about["scenario"], about["name"])
+    scenario = scenario_of(team) if team is not None else loads(about["scenario"], about["name"])
     return _start(scenario, given, files, full, progress)
 
 
@@ -154,8 +154,8 @@ def _start(
     """Check the settings, and run; `given` are the arguments of `run`."""
     about = {"scenario": scenario.text, "name": scenario.source, "given": {key: _as_data(value) for key, value in given.items()}}
     if given["auxiliary"] is not None:
-        scenario = _with_auxiliary(scenario, given["auxiliary"])
-    settings = _settings(scenario.settings, given)
+        scenario = with_auxiliary(scenario, given["auxiliary"])
+    settings = settings_of(scenario.settings, given)
     kind = settings.protocol.kind
     if kind not in FLOWS and kind not in ROUNDS:
         raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
@@ -165,7 +165,7 @@ def _start(
     keep = _Keep(given["agents"], given["record"], given["every"], files, about)
     if kind in FLOWS:
         _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
-        return _run(scenario, settings, full, keep, functools.partial(_flow, settings.protocol, until=until, **options))
+        return _run(scenario, settings, full, keep, functools.partial(_flow, until=until, **options))
     _refuse(f"protocol {kind} goes in rounds; use rounds", until=until)
     if (speed is not None and rate is None) or not all(value is None or value > 0 for value in (speed, rate)):
         raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
@@ -173,7 +173,7 @@ def _start(
         raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
     weather = Weather(loss, sleep, settings.start.seed)
     body = None if rate is None else Body(rate, np.inf if speed is None else speed)
-    simulate = functools.partial(_rounds, settings.protocol, rounds=rounds, weather=weather, body=body, **options)
+    simulate = functools.partial(_rounds, rounds=rounds, weather=weather, body=body, **options)
     return _run(scenario, settings, full, keep, simulate)
 
 
@@ -186,7 +186,7 @@ def _as_data(value: Any) -> Any:
     return value if isinstance(value, str) or not isinstance(value, Sequence) else [_as_data(each) for each in value]
 
 
-def _settings(asked: Settings, given: Mapping[str, Any]) -> Settings:
+def settings_of(asked: Settings, given: Mapping[str, Any]) -> Settings:
     """What the scenario asks for, and `given` overrides."""
     start, seed = given["start"], given["seed"]
     kind, estimates = given["protocol"] or asked.protocol.kind or DEFAULT_PROTOCOL, given["estimates"] or asked.protocol.estimates
@@ -204,14 +204,47 @@ def _refuse(why: str, **given: float | None) -> None:
         raise InvalidSettings(f"{why}; {', '.join(wrong)} means nothing to it")
 
 
-class _Prepared(NamedTuple):
-    """A team made ready to run."""
+class Prepared(NamedTuple):
+    """A team made ready to run.
+
+    Attributes:
+        team: the team.
+        copies: the layout of estimates.
+        schedule: of ν.
+        size: the team's natural size.
+        settings: what holds.
+    """
 
     team: Team
     copies: Estimates
     schedule: Schedule
     size: Scale
-    first: np.ndarray
+    settings: Settings
+
+    @classmethod
+    def of(cls, team: Team, settings: Settings) -> Prepared:
+        """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
+        size = scale(team)
+        schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+        return cls(team, Estimates.of(team, settings.protocol.estimates), schedule, size, settings)
+
+    def first(self, start: Start | None = None) -> np.ndarray:
+        """(C, d) first estimates, drawn as the settings say, or otherwise."""
+        return first_estimates(self.team, self.copies, start or self.settings.start, self.size)
+
+    @property
+    def convex(self) -> bool:
+        """Whether every ψ is known to be concave."""
+        return bool(shape_of(self.team).concave.all())
+
+    def hopeless(self, position: np.ndarray) -> bool:
+        """Whether (N, d) positions prove that no formation satisfies every constraint."""
+        return bounds(self.team, position, self.schedule.final).verdict == "infeasible"
+
+    @property
+    def enough(self) -> Callable[[np.ndarray], bool] | None:
+        """Says of (N, d) positions whether no formation is better by more than a tolerance; None where nobody asks."""
+        return (lambda position: _gap(self.team, position) <= SHARP * self.size.psi) if self.settings.protocol.kind == "max-min" else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,31 +268,27 @@ class _Keep:
 @float64
 def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simulate: Callable[..., Trace]) -> Result:
     team = scenario.team
-    copies, size = Estimates.of(team, settings.protocol.estimates), scale(team)
-    schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    first = first_estimates(team, copies, settings.start, size)
-    options = keep.options(team, copies, "time" if settings.protocol.kind in FLOWS else "round")
-    trace = simulate(_Prepared(team, copies, schedule, size, first), **options)
-    summary = summarise(scenario, settings, schedule, size, trace, full)
+    ready = Prepared.of(team, settings)
+    options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
+    trace = simulate(ready, **options)
+    summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
     if keep.files is not None:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
-def _flow(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
-    return simulate_flow(
-        on.team, with_gains(FLOWS[str(asked.kind)](), asked), on.copies, on.schedule, on.first,
-        infeasible=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible", **options,
-    )  # fmt: skip
+def _flow(on: Prepared, **options: Any) -> Trace:
+    asked = on.settings.protocol
+    flow = with_gains(FLOWS[str(asked.kind)](), asked)
+    return simulate_flow(on.team, flow, on.copies, on.schedule, on.first(), infeasible=on.hopeless, **options)
 
 
-def _rounds(asked: ProtocolSettings, on: _Prepared, **options: Any) -> Trace:
+def _rounds(on: Prepared, **options: Any) -> Trace:
+    asked = on.settings.protocol
     return simulate_rounds(
-        on.team, with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first,
-        convex=bool(shape_of(on.team).concave.all()),
-        hopeless=lambda position: bounds(on.team, position, on.schedule.final).verdict == "infeasible",
-        enough=(lambda position: _gap(on.team, position) <= SHARP * on.size.psi) if asked.kind == "max-min" else None, **options,
+        on.team, with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first(),
+        convex=on.convex, hopeless=on.hopeless, enough=on.enough, **options,
     )  # fmt: skip
 
 
@@ -284,19 +313,19 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
     from consat.reasons import explain
     from consat.reference import max_min
 
-    scenario = _scenario(team)
+    scenario = scenario_of(team)
     if auxiliary is not None:
-        scenario = _with_auxiliary(scenario, auxiliary)
+        scenario = with_auxiliary(scenario, auxiliary)
     problem = scenario.team
     optimum = max_min(problem, seed=seed)
     certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
     return {
         "schema": SOLVE_SCHEMA,
         "scenario": scenario.name,
-        "margin": _number(optimum.margin),
-        "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
+        "margin": number(optimum.margin),
+        "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
         "verdict": certificate.verdict,
-        "positions": {agent: [_number(x) for x in row] for agent, row in zip(problem.ids, optimum.positions, strict=True)},
+        "positions": {agent: [number(x) for x in row] for agent, row in zip(problem.ids, optimum.positions, strict=True)},
         "binding": [
             {"agent": problem.ids[problem.owner[k]], "constraint": problem.names[k], "multiplier": float(optimum.multipliers[k])}
             for k in np.argsort(-optimum.multipliers, kind="stable")
@@ -341,7 +370,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     team, position = scenario.team, trace.end
     nu = schedule.final
     margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
-    margin = _number(margins.min(initial=np.inf))
+    margin = number(margins.min(initial=np.inf))
     certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
     period = 1.0 if trace.clock == "time" else trace.period
@@ -352,11 +381,11 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "protocol": settings.protocol.kind,
         "estimates": settings.protocol.estimates,
         "seed": settings.start.seed,
-        "status": _status(trace, margin, certificate.verdict, size.length),
+        "status": status_of(trace.ending, trace.moved_lately, margin, certificate.verdict, size.length),
         "verdict": certificate.verdict,
         "margin": margin,
-        "smooth_margin": _number(trace.smooth_margin[-1]),
-        "bounds": [_number(certificate.lower), None if certificate.upper is None else _number(certificate.upper)],
+        "smooth_margin": number(trace.smooth_margin[-1]),
+        "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
         "satisfied_from": {
             "time": None if trace.satisfied_from is None or period is None else trace.satisfied_from * period,
             "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
@@ -367,7 +396,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "ending": trace.ending,
         "messages": trace.messages,
         "floats_sent": trace.floats_sent,
-        "positions": {agent: [_number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
+        "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
         "agents": _agents(team, margins, multipliers) if listed else None,
         "clusters": _clusters(team, trace.cluster) if listed else None,
         "count": team.count,
@@ -376,10 +405,11 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     }
 
 
-def _with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
-    from consat.assumptions import with_auxiliary
+def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
+    """The scenario with the auxiliary constraint added to every agent."""
+    from consat import assumptions
 
-    return dataclasses.replace(scenario, team=with_auxiliary(scenario.team, radius))
+    return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
 
 
 def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
@@ -389,7 +419,8 @@ def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, 
     return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}
 
 
-def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
+def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
+    """What `run` was given, as a scenario."""
     if isinstance(team, Scenario):
         return team
     if not isinstance(team, Team):
@@ -401,12 +432,13 @@ def _scenario(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
     return Scenario(name="team", team=team, settings=Settings(), text=text, source="team")
 
 
-def _status(trace: Trace, margin: float | None, verdict: str, length: float) -> str:
-    if trace.ending == "diverged":
+def status_of(ending: str, moved: float, margin: float | None, verdict: str, length: float) -> str:
+    """How a run ended, for people: `moved` is how far any agent moved lately, `length` the team's unit of length."""
+    if ending == "diverged":
         return "diverged"
     if margin is not None and margin > 0:
         return "satisfied"
-    arrived = trace.moved_lately <= AT_REST * length
+    arrived = moved <= AT_REST * length
     return "least-violating" if verdict == "infeasible" and arrived else "not-converged"
 
 
@@ -414,8 +446,8 @@ def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray) -> Mapping
     agents: dict[str, Any] = {agent: {"margin": None, "constraints": []} for agent in team.ids}
     for owner, name, margin, multiplier in zip(team.owner, team.names, margins, multipliers, strict=True):
         agent = agents[team.ids[owner]]
-        value = _number(margin)
-        agent["constraints"].append({"name": name, "margin": value, "multiplier": _number(multiplier)})
+        value = number(margin)
+        agent["constraints"].append({"name": name, "margin": value, "multiplier": number(multiplier)})
         agent["margin"] = value if agent["margin"] is None or value is None else min(agent["margin"], value)
     return agents
 
@@ -427,6 +459,6 @@ def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:
     return members
 
 
-def _number(value: Any) -> float | None:
+def number(value: Any) -> float | None:
     """A float for JSON, which knows no infinity: null instead."""
     return float(value) if np.isfinite(value) else None

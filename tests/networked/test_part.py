@@ -107,7 +107,7 @@ def part_text() -> str:
         ("listen: ", "listens: ", "there is no key 'listens' in a part"),
         ("kind: near", "kind: !!python/object:os.system near", "tags (!) are not part of a scenario"),
         ("tcp/127.0.0.1:7447", "tcp/127.0.0.1", "but String must match pattern"),
-        ("concave: true", "concave: perhaps", "concave: it is 'perhaps', but must be a valid boolean"),
+        ("convex: true", "convex: perhaps", "convex: it is 'perhaps', but must be a valid boolean"),
     ],
 )
 def test_a_bad_part_is_told_by_line_and_column(old: str, new: str, message: str) -> None:

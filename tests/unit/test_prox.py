@@ -15,6 +15,8 @@ from consat import prox
 from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Nu
+from consat.prox import newton
+from consat.prox.lanes import Lanes
 
 BOXES = (4.0, 1e2, 1e4, 1e6)
 SMOOTHINGS = (0.05, 5.0, 1e3)
@@ -145,14 +147,15 @@ def solve(team: cs.Team, *, convex: bool, setup: Setup | None = None, copies: Es
     """Every agent's prox, without a last solution to begin from."""
     copies = copies or Estimates.of(team, "local")
     setup = setup or problems(copies.count)
-    batches = prox.buckets(team, copies.rows, copies.count, convex)
+    plan = prox.buckets(team, copies.rows, copies.count, convex)
+    precision = prox.Precision(TOLERANCE)
 
     @jax.jit
     @jax.vmap
     def both(alpha: jax.Array, kappa: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
         nu, weight = Nu(alpha, RATIO * alpha), jnp.full(copies.count, kappa)
-        memory = prox.recall(batches, team.count, nu, v, weight)
-        y, _, stiffness = prox.step(batches, nu, v, weight, v, memory, offset=0.0, tolerance=TOLERANCE)
+        memory = prox.recall(plan, nu, v, weight)
+        y, _, stiffness = prox.step(plan, nu, v, weight, v, memory, offset=0.0, precision=precision)
         return y, stiffness
 
     y, stiffness = both(jnp.asarray(setup.alpha), jnp.asarray(setup.kappa), jnp.asarray(setup.v))
@@ -281,17 +284,17 @@ def test_padding_does_not_matter(concave: Solved) -> None:
 @float64
 def test_warm_start_takes_few_iterations() -> None:
     team = cs.Team([cs.Agent("a", [cs.within([0, 0], 20), cs.within([20, 3], 1)])])
-    (batch,) = prox.buckets(team, Estimates.of(team, "local").rows, 1, True)
-    one = prox._One(batch.psi, jax.tree.map(lambda leaf: leaf[0], batch.kinds), Nu(jnp.asarray(5.0), jnp.asarray(3.0)), 0.0)
+    (batch,) = prox.buckets(team, Estimates.of(team, "local").rows, 1, True).batches
+    lanes = Lanes(batch, jax.tree.map(lambda leaf: leaf[0], batch.kinds), Nu(jnp.asarray(5.0), jnp.asarray(3.0)), jnp.zeros(1))
     kappa = jnp.ones((1, 1))
 
     @jax.jit
-    def again(v: jax.Array, guess: prox.Guess) -> tuple[prox.Guess, jax.Array, jax.Array]:
-        return prox.solve(one.level, v, kappa, guess, TOLERANCE, True)
+    def again(v: jax.Array, guess: prox.Guess) -> newton.Found:
+        return newton.solve(lanes, v, kappa, guess, prox.Precision(TOLERANCE))
 
     for seed, box in enumerate(BOXES):
-        v = jnp.asarray(np.random.default_rng(seed).uniform(-box, box, (1, 2)))
-        guess, _, cold = again(v, prox.cold(one.violations, one.level, one.nu, v, kappa))
-        _, _, warm = again(v * 1.001, guess)
-        assert int(cold) < prox.MOST_ITERATIONS
-        assert int(warm) <= 5  # a change of 1e-3, then quadratic convergence, 1e-6, 1e-12, and the step that finds itself done
+        v = jnp.asarray(np.random.default_rng(seed).uniform(-box, box, (1, 2, 1)))
+        guess, _, cold, _ = again(v, newton.cold(lanes, v, kappa))
+        _, _, warm, _ = again(v * 1.001, guess)
+        assert int(cold[0]) < prox.MOST_ITERATIONS
+        assert int(warm[0]) <= 5  # a change of 1e-3, then quadratic convergence, 1e-6, 1e-12, and the step that finds itself done

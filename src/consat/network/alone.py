@@ -15,8 +15,8 @@ from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.scale import Region
 
-TOLERANCE = 1e-9
-"""Of the local step, relative; as in `consat.simulate.rounds`."""
+PRECISION = prox.Precision(tolerance=1e-9)
+"""Of the local step; as in `consat.simulate.kernel` for small teams."""
 
 
 @jax.tree_util.register_dataclass
@@ -68,7 +68,7 @@ class Alone:
         links: its ends of its links.
         length: the team's unit of length.
         region: where the team's places are.
-        batches: itself, if it has constraints.
+        plan: of its own local step, if it has constraints.
         nu: the smoothing.
         local: its objective over the positions it holds.
         talkers: all ends in one group.
@@ -81,7 +81,7 @@ class Alone:
     links: OwnLinks
     length: Array
     region: Region
-    batches: tuple[prox.Bucket, ...]
+    plan: prox.Plan
     nu: Nu
     local: Objective
     talkers: Groups
@@ -94,29 +94,32 @@ class Alone:
     def of(cls, part: Part) -> Alone:
         """The solver of a part; its rows are in the order of `part.team.ids`."""
         team = part.team
-        batches = prox.buckets(team, lambda _, position: position, team.count, part.concave)
+        me = team.ids.index(part.me)
+        plan = prox.buckets(team, lambda _, position: position, team.count, part.convex)
         return cls(
             links=OwnLinks.of(part),
             length=jnp.asarray(part.length),
             region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
-            batches=tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in batches),
+            plan=prox.Plan(
+                tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches), plan.row, plan.agent[me : me + 1], 1
+            ),
             nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
             local=Objective.at_positions(team),
             talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
-            me=team.ids.index(part.me),
+            me=me,
             rows=team.count,
             hops=part.hops,
             convex=part.convex,
         )
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        return prox.recall(self.batches, 1, self.nu, x, kappa)
+        return prox.recall(self.plan, self.nu, x, kappa)
 
     def prox(
         self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[Array, prox.Memory, Array]:
         nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
+        return prox.step(self.plan, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), precision=PRECISION)
 
     def nearby(self, x: Array) -> Array:
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))

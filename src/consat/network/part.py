@@ -65,7 +65,6 @@ class _File(Model):
     reach: Gain
     convex: bool
     hops: Annotated[int, Field(ge=0, le=10**6)]
-    concave: bool
     first: dict[Word, tuple[Number, ...]]
     absent: tuple[Word, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
@@ -86,7 +85,6 @@ class Part:
         reach: how far around it the team's places are; see `consat.scale.Region`.
         convex: whether every ψ of the team is proven concave.
         hops: links that a message crosses, at most, from one agent to another.
-        concave: whether all its own ψ are proven concave.
         team: a team in which it alone has constraints; the others are the agents whose positions it holds.
         settings: protocol and smoothing.
         first: (copies, d) first estimates of the positions it holds, in the order of `team.ids`.
@@ -103,7 +101,6 @@ class Part:
     reach: float
     convex: bool
     hops: int
-    concave: bool
     team: Team
     settings: Settings
     first: np.ndarray
@@ -248,7 +245,6 @@ def split(
             )
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, size.center, size.reach, bool(concave.all()), across,
-            bool(concave[team.owner == owner].all()),
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
         )  # fmt: skip
     return parts
@@ -277,7 +273,6 @@ def write_part(part: Part) -> str:
             "reach": part.reach,
             "convex": part.convex,
             "hops": part.hops,
-            "concave": part.concave,
             "first": {agent: row.tolist() for agent, row in zip(part.team.ids, part.first, strict=True)},
             "absent": sorted(part.absent),
             "neighbours": [neighbour.model_dump(mode="json") for neighbour in part.neighbours],
@@ -323,7 +318,7 @@ def read_part(text: str, file: str) -> Part:
         raise document.invalid(faults)
     return Part(
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, np.array(frame.center, dtype=float),
-        frame.reach, frame.convex, frame.hops, frame.concave, team, settings,
+        frame.reach, frame.convex, frame.hops, team, settings,
         np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
     )  # fmt: skip
 

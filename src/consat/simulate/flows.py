@@ -171,9 +171,8 @@ def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
             throw=False,
         )
         (seen, moved), last = solution.ys
-        # moments that the integration did not reach are filled with ∞, which would be a margin to be proud of
-        lost = jnp.isinf(moved)
-        seen = jax.tree.map(lambda leaf: jnp.where(lost.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf), seen)
+        # where the solver did not get
+        seen = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(moved).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan), seen)
         return seen, jax.tree.map(lambda leaf: leaf[-1], last), solution.result == diffrax.RESULTS.successful, jnp.max(moved)
 
     return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
@@ -182,11 +181,6 @@ def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
 @functools.partial(jax.jit, static_argnames=("flow",))
 def _first_look(flow: Flow, problem: Problem, observer: Observer, time: Array, state: State) -> Observed:
     return jax.tree.map(lambda leaf: leaf[None], observer.look(flow, problem, time, state))
-
-
-@jax.jit
-def _finite(state: State) -> Array:
-    return jnp.all(jnp.isfinite(state.x)) & jnp.all(jnp.isfinite(state.z))
 
 
 @float64
@@ -251,8 +245,8 @@ def simulate_flow(
             tally.add(sink, choice, times[1:], seen, float(moved))
             heard = told(progress, times[-1] / end, tally.margin)
             if not fine:
-                sound = _finite(state) & _finite(rate(flow, problem, times[-1], state))
-                found: Ending | None = "too stiff" if bool(sound) else "diverged"
+                found: Ending | None = "too stiff" if np.isfinite(tally.drift) else "diverged"
+                state = state if found == "too stiff" else jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state)
             else:
                 found = _ending(tally, stop, schedule, state.x[observer.own], infeasible)
             if found is None and (stopped() or not heard):

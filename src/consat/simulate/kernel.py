@@ -20,8 +20,11 @@ from consat.protocols import Rounds, agreement
 from consat.scale import Region, Scale
 from consat.team import Team
 
-TOLERANCE = 1e-9
-"""Of every local step, relative."""
+EXACT = prox.Precision(tolerance=1e-9)
+"""Of every local step of a small team."""
+QUICK = prox.Precision(tolerance=None)
+"""Of every local step of a large one: there the arithmetic counts, and an exact step saves no rounds. Each begins where the last ended, so
+that the steps become exact as the team comes to rest."""
 
 
 @jax.tree_util.register_dataclass
@@ -73,7 +76,8 @@ class Everyone:
         links: all ends.
         length: the team's unit of length.
         region: where the team's places are.
-        batches: the agents by shape.
+        plan: the agents by shape, for their local steps.
+        precision: of these.
         nu: the smoothing.
         local: every agent's objective over its copies.
         holder: (C,) who holds each copy.
@@ -86,7 +90,7 @@ class Everyone:
     links: Ends
     length: Array
     region: Region
-    batches: tuple[prox.Bucket, ...]
+    plan: prox.Plan
     nu: Nu
     local: Objective
     holder: Array
@@ -94,15 +98,16 @@ class Everyone:
     agents: int = field(metadata={"static": True})
     hops: int = field(metadata={"static": True})
     convex: bool = field(metadata={"static": True})
+    precision: prox.Precision = field(metadata={"static": True})
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        return prox.recall(self.batches, self.agents, self.nu, x, kappa)
+        return prox.recall(self.plan, self.nu, x, kappa)
 
     def prox(
         self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[Array, prox.Memory, Array]:
         nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.batches, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), tolerance=TOLERANCE)
+        return prox.step(self.plan, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), precision=self.precision)
 
     def nearby(self, x: Array) -> Array:
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
@@ -161,6 +166,26 @@ class Seen(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Part:
+    """How the agents of a process stand in the whole team. They come first; behind them the neighbours of other processes.
+
+    Attributes:
+        agent: (n,) numbers in the team.
+        pair: numbers of the pairs.
+        ours: (n,) whose agents they are: this process's.
+        agents: N of the team.
+        pairs: of the team.
+    """
+
+    agent: Array
+    pair: Array
+    ours: Array
+    agents: int = field(metadata={"static": True})
+    pairs: int = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class World:
     """Everything a round needs that does not change.
 
@@ -175,6 +200,7 @@ class World:
         sleep: see `Weather`.
         pairs: how many directed pairs.
         rough: whether messages can be lost or agents sleep.
+        part: of which larger team this is a part; None of none.
     """
 
     everyone: Everyone
@@ -187,6 +213,7 @@ class World:
     sleep: Array
     pairs: int = field(metadata={"static": True})
     rough: bool = field(metadata={"static": True})
+    part: Part | None = None
 
 
 class Now(NamedTuple):
@@ -205,31 +232,82 @@ class Now(NamedTuple):
     key: Array
 
 
+class Spoken(NamedTuple):
+    """Between speaking and hearing.
+
+    Attributes:
+        state: of the protocol, after its step.
+        ages: likewise.
+        message: what stands at each end, on its way to the other.
+        told: (E,) the ages among it.
+        went: (E,) whether it was sent and not lost; None where nothing is.
+        key: of the random draws that follow.
+        messages: sent.
+        floats: sent.
+    """
+
+    state: Any
+    ages: agreement.Ages
+    message: Any
+    told: Array
+    went: Array | None
+    key: Array
+    messages: Array
+    floats: Array
+
+
 def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
     """What all agents do in one round."""
+    spoken = speak(protocol, world, now, round_)
+    now, known = hear(protocol, world, now, spoken)
+    return now, see(world, now.state.x, now.body, known, spoken.messages, spoken.floats)
+
+
+def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
+    """The first half of a round."""
     everyone, ends = world.everyone, world.everyone.links
-    spoken, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
-    ages, told = agreement.speak(now.ages, spoken.x, everyone)
-    arrived = jnp.ones(len(ends.row), dtype=bool)
-    key, sent, copies_sent = now.key, jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
+    state, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
+    ages, told = agreement.speak(now.ages, state.x, everyone)
+    key, went = now.key, None
+    sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
+    counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
     if world.rough:
-        key, draw_loss, draw_sleep = jax.random.split(now.key, 3)
-        awake = jax.random.uniform(draw_sleep, (everyone.agents,)) >= world.sleep
-        spoken = _where_awake(protocol.per, world, awake, spoken, now.state)
+        key, awake, through = _luck(world, now.key)
+        state = _where_awake(protocol.per, world, awake, state, now.state)
         ages = _where_awake({"age": "agent", "heard": "link"}, world, awake, ages, now.ages)
         goes = awake[world.talker]
-        sent = jnp.sum(jax.ops.segment_max(goes.astype(int), world.pair, world.pairs))
-        copies_sent = jnp.sum(goes)
-        arrived = (goes & (jax.random.uniform(draw_loss, (world.pairs,)) >= world.loss)[world.pair])[ends.other]
-    state = protocol.hear(spoken, jax.tree.map(lambda leaf: leaf[ends.other], message), arrived, everyone)
-    ages = agreement.hear(ages, told[ends.other], arrived)
+        went = goes & through[world.pair]
+        counted = goes if counted is None else goes & counted
+    if counted is not None:
+        sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
+        copies_sent = jnp.sum(counted)
+    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
+    return Spoken(state, ages, message, told, went, key, sent, floats)
+
+
+def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
+    """The next key, (N,) who is awake, and (pairs,) between whom messages get through."""
+    key, draw_loss, draw_sleep = jax.random.split(key, 3)
+    part = world.part
+    if part is None:
+        awake, through = jax.random.uniform(draw_sleep, (world.everyone.agents,)), jax.random.uniform(draw_loss, (world.pairs,))
+    else:  # the same as in one process
+        awake = jax.random.uniform(draw_sleep, (part.agents,))[part.agent]
+        through = jax.random.uniform(draw_loss, (part.pairs,))[part.pair]
+    return key, awake >= world.sleep, through >= world.loss
+
+
+def hear(protocol: Rounds, world: World, now: Now, spoken: Spoken) -> tuple[Now, Array]:
+    """The second half of a round; tells also whether everybody knows that all are satisfied."""
+    everyone, ends = world.everyone, world.everyone.links
+    arrived = jnp.ones(len(ends.row), dtype=bool) if spoken.went is None else spoken.went[ends.other]
+    state = protocol.hear(spoken.state, jax.tree.map(lambda leaf: leaf[ends.other], spoken.message), arrived, everyone)
+    ages = agreement.hear(spoken.ages, spoken.told[ends.other], arrived)
     target = state.x[world.own]
     away = target - now.body
     distance = jnp.linalg.norm(away, axis=1, keepdims=True)
     body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
-    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
-    known = jnp.all(agreement.known(ages, everyone) > 0)
-    return Now(state, ages, body, key), see(world, state.x, body, known, sent, floats)
+    return Now(state, ages, body, spoken.key), jnp.all(agreement.known(ages, everyone) > 0)
 
 
 def see(world: World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
@@ -270,6 +348,11 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
     return now, see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0))
 
 
+def precision_for(count: int) -> prox.Precision:
+    """Of the local steps of a team of so many agents."""
+    return EXACT if count <= prox.SMALL_TEAM else QUICK
+
+
 def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None) -> World:
     """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`."""
     ends = Ends.of(copies)
@@ -277,7 +360,7 @@ def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool
         links=ends,
         length=jnp.asarray(size.length),
         region=Region.of(size),
-        batches=prox.buckets(team, copies.rows, copies.count, convex),
+        plan=prox.buckets(team, copies.rows, copies.count, convex),
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
         holder=jnp.asarray(copies.holder),
@@ -285,6 +368,7 @@ def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool
         agents=team.count,
         hops=hops(team.count, copies.links),
         convex=convex,
+        precision=precision_for(team.count),
     )
     talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
     pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)

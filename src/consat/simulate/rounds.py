@@ -31,6 +31,8 @@ PATIENCE = 2000
 """How many rounds a team may take when nobody says."""
 CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
+PATIENT = 1.5
+"""Whether a team that stands still has no hope is asked again only when the run is so many times as long: the answer takes its time."""
 NEVER = 2**62
 """More rounds than there are."""
 SETTLED = 1e-5
@@ -107,7 +109,7 @@ class Engine(Protocol):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class _Chosen:
+class Chosen:
     """Who is recorded.
 
     Attributes:
@@ -119,7 +121,7 @@ class _Chosen:
     copies: Array
 
     @classmethod
-    def of(cls, choice: Choice) -> _Chosen:
+    def of(cls, choice: Choice) -> Chosen:
         agents = None if choice.everyone else jnp.asarray(choice.agents)
         return cls(agents, jnp.asarray(np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)))
 
@@ -136,7 +138,8 @@ class _Loop(NamedTuple):
     chunk: Chunk
 
 
-def _start(protocol: Rounds, world: World, chosen: _Chosen, first: Array, key: Array) -> tuple[Now, Chunk]:
+def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Array) -> tuple[Now, Chunk]:
+    """See `Engine.start`."""
     now, seen = begin(protocol, world, first, key)
     kept = Kept(*(jnp.expand_dims(leaf, 0) for leaf in chosen.of_seen(seen)))
     scalars = {name: getattr(seen, name)[None] for name in SCALARS}
@@ -146,7 +149,7 @@ def _start(protocol: Rounds, world: World, chosen: _Chosen, first: Array, key: A
 SCALARS = ("margin", "smooth_margin", "known", "messages", "floats")
 
 
-class _Ask(NamedTuple):
+class Ask(NamedTuple):
     """Of the arguments of `Engine.advance` the numbers, and `hold`: how many satisfied rounds on end end the run."""
 
     number: Array
@@ -156,7 +159,7 @@ class _Ask(NamedTuple):
     hold: Array
 
 
-def _advance(protocol: Rounds, world: World, chosen: _Chosen, capacity: int, now: Now, ask: _Ask) -> tuple[Now, Chunk]:
+def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: Now, ask: Ask) -> tuple[Now, Chunk]:
     """Rounds until there are so many, or enough on end are satisfied; what is kept of them goes into buffers of `capacity`."""
     anchor = now.body
     real, whole = now.body.dtype, jnp.asarray(0).dtype
@@ -198,12 +201,12 @@ def _advance(protocol: Rounds, world: World, chosen: _Chosen, capacity: int, now
     return end.now, end.chunk
 
 
-def _one(protocol: Rounds, world: World, chosen: _Chosen, now: Now, number: Array) -> tuple[Now, tuple[Array, ...], Kept]:
+def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array) -> tuple[Now, tuple[Array, ...], Kept]:
     now, seen = one_round(protocol, world, now, number.astype(float))
     return now, tuple(getattr(seen, name) for name in SCALARS), chosen.of_seen(seen)
 
 
-def _look(world: World, chosen: _Chosen, now: Now) -> Kept:
+def _look(world: World, chosen: Chosen, now: Now) -> Kept:
     nothing = jnp.asarray(0)
     return chosen.of_seen(see(world, now.state.x, now.body, nothing, nothing, nothing))
 
@@ -212,8 +215,8 @@ def _look(world: World, chosen: _Chosen, now: Now) -> Kept:
 def _compiled() -> tuple[Callable[..., tuple[Now, Chunk]], Callable[..., tuple[Now, Chunk]], Callable[..., Kept]]:
     options = quick_compilation()
     return (
-        jax.jit(_start, static_argnames=("protocol",), compiler_options=options),
-        jax.jit(_advance, static_argnames=("protocol", "capacity"), donate_argnames=("now",), compiler_options=options),
+        jax.jit(start, static_argnames=("protocol",), compiler_options=options),
+        jax.jit(advance, static_argnames=("protocol", "capacity"), donate_argnames=("now",), compiler_options=options),
         jax.jit(_look, compiler_options=options),
     )
 
@@ -232,7 +235,7 @@ class OneProcess:
 
     def __init__(self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None) -> None:
         self._first, self._seed, self._hold = first, seed, hold
-        self._protocol, self._world, self._chosen = protocol, world, _Chosen.of(choice)
+        self._protocol, self._world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
 
     def start(self) -> tuple[Now, Chunk]:
@@ -241,7 +244,7 @@ class OneProcess:
 
     def advance(self, state: Now, number: int, count: int, streak: int, every: int) -> tuple[Now, Chunk]:
         hold = NEVER if self._hold is None else self._hold
-        ask = _Ask(*(jnp.asarray(value) for value in (number, count, streak, every, hold)))
+        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak, every, hold)))
         return _compiled()[1](self._protocol, self._world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:
@@ -266,6 +269,7 @@ class Tally:
         margin: the last.
         smooth_margin: the last.
         drift: of the last chunk.
+        asked: the round at which it was last asked whether there is hope.
         recorded: steps in the record.
         every: each how manieth round is recorded.
     """
@@ -279,6 +283,7 @@ class Tally:
     margin: float = np.nan
     smooth_margin: float = np.nan
     drift: float = np.inf
+    asked: int = 0
     recorded: int = 0
     every: int = 1
 
@@ -297,6 +302,11 @@ class Tally:
         self.margin, self.smooth_margin = float(margin[-1]), float(chunk.smooth_margin[count - 1])
         self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
         return numbers
+
+
+def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> float:
+    """A chunk in which no position moved farther is one in which the team stood still; length: the team's unit."""
+    return (SETTLED if enough is None else SETTLED_ALL_THE_SAME) * length
 
 
 @float64
@@ -347,9 +357,9 @@ def simulate_rounds(
     world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body)
     choice = choice or Choice.of(team, copies, estimates=record)
     engine = OneProcess(protocol, world, first, weather.seed, choice, HOLD if stop == "satisfied" else None)
-    still = SETTLED if enough is None else SETTLED_ALL_THE_SAME
     rules = Rules(
-        end=PATIENCE if rounds is None else rounds, stop=stop, still=still * size.length, earliest=protocol.earliest(world.everyone),
+        end=PATIENCE if rounds is None else rounds, stop=stop, still=stillness(size.length, enough),
+        earliest=protocol.earliest(world.everyone),
         hopeless=hopeless, enough=enough,
     )  # fmt: skip
     problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
@@ -396,8 +406,14 @@ class Rules:
             return "satisfied"
         if self.stop == "converged" and self.enough is not None and self.enough(positions()):
             return "settled"
-        settled = tally.done >= self.earliest and tally.drift <= self.still
-        return "settled" if settled and (self.stop == "converged" or self.hopeless(positions())) else None
+        if tally.done < self.earliest or tally.drift > self.still:
+            return None
+        if self.stop == "converged":
+            return "settled"
+        if tally.done < PATIENT * tally.asked:
+            return None
+        tally.asked = tally.done
+        return "settled" if self.hopeless(positions()) else None
 
 
 def conduct(

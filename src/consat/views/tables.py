@@ -1,4 +1,4 @@
-"""What `consat check` and `consat solve` show on a terminal."""
+"""What `consat check`, `consat solve` and `consat sweep` show on a terminal."""
 
 from __future__ import annotations
 
@@ -66,6 +66,31 @@ def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield f"  … and {len(agents) - MOST_ROWS} agents more; --json lists all"
     for reason in answer["reasons"]:
         yield f"[bold]→[/] {escape(reason)}"
+
+
+def sweep(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """The outcome of `consat.sweep`, for people: a row for each combination of values."""
+    groups = summary["groups"]
+    each = f", {groups[0]['runs']:,} seeds each" if len(groups) > 1 else ""
+    yield f"[bold]{escape(summary['scenario'])}[/]: {summary['count']:,} runs of {summary['protocol']}{each}, in {summary['seconds']:.1f} s"
+    flows = groups[0]["messages"] is None
+    since = "time to satisfaction, s" if flows else "rounds to satisfaction"
+    table = _table(*map(escape, summary["over"]), "satisfied", since, "10 % – 90 %", "margin", "10 % – 90 %")
+    for column in table.columns[len(summary["over"]) :]:
+        column.justify = "right"
+    for group in groups[:MOST_ROWS]:
+        cells = [escape(str(value)) for value in group["values"].values()]
+        colour = "green" if group["success"] == 1 else "yellow" if group["success"] else "red"
+        cells.append(f"[{colour}]{group['success']:.1%}[/]")
+        for name in ("satisfied_from", "margin"):
+            found = group[name]
+            cells += ["–", ""] if found is None else [
+                f"{found['mean']:.3g} ± {found['std']:.2g}", f"{found['10 %']:.3g} – {found['90 %']:.3g}"
+            ]  # fmt: skip
+        table.add_row(*cells)
+    yield table
+    if len(groups) > MOST_ROWS:
+        yield f"  … and {len(groups) - MOST_ROWS} more; --json and --out list all"
 
 
 def _table(*columns: str) -> Table:

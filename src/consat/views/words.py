@@ -40,6 +40,16 @@ def summary(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def sweep(summary: Mapping[str, Any]) -> str:
+    """A sweep in a few lines, a line for each combination of values."""
+    lines = [f"{summary['scenario']}: {summary['count']:,} runs of {summary['protocol']} in {summary['seconds']:.1f} s"]
+    for group in summary["groups"]:
+        named = ", ".join(f"{path} = {value}" for path, value in group["values"].items()) or "all"
+        since, margin = ("none" if group[k] is None else _number(group[k]["mean"]) for k in ("satisfied_from", "margin"))
+        lines.append(f"  {named}: {group['success']:.1%} satisfied, from {since} on the mean; margin {margin} on the mean")
+    return "\n".join(lines)
+
+
 def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "verdict", VERDICT[summary["verdict"]]
     yield "margin", f"{_number(summary['margin'])} (smooth margin {_number(summary['smooth_margin'])})"

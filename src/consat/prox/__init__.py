@@ -1,0 +1,155 @@
+"""The local proximal step: every agent's own small problem, from any start (design, section 4).
+
+    x⁺ = argmin_y  f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖²,      f_i = e^{L_i},  L_i = −ν_β α_i
+
+over the rows r that the agent's constraints read (the others stay at v). f_i overflows far from satisfaction and its gradient underflows
+near it, so e^{L} is replaced by its conjugate: with ln of the multiplier, σ, as one more unknown, the step is the saddle point
+
+    κ (y − v) + e^σ ∇L(y) = 0,        L(y) − σ = 0.
+
+`batches` sorts the agents, `lanes` computes L and its derivatives for many at once, `newton` solves.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from consat.objective import Nu
+from consat.prox.batches import SMALL_TEAM, Batch, Kind, Plan, buckets
+from consat.prox.lanes import Lanes
+from consat.prox.newton import MOST_ITERATIONS, STRONGEST, Found, Guess, Precision, cold, solve, solve_if_near
+
+__all__ = ["MOST_ITERATIONS", "SMALL_TEAM", "STRONGEST", "Guess", "Memory", "Plan", "Precision", "buckets", "recall", "step"]
+
+
+class Memory(NamedTuple):
+    """What the solver of each agent keeps for its next step, (N,): ln of the multiplier, and the sharpness reached."""
+
+    sigma: Array
+    sharpness: Array
+
+
+def recall(plan: Plan, nu: Nu, x: Array, kappa: Array) -> Memory:
+    """What to remember before the first step from x, (rows, d), at weights κ, (rows,)."""
+    x, kappa = _padded(x), _padded(kappa)
+
+    def begin(batch: Batch, part: Part) -> tuple[Array, Array]:
+        lanes = Lanes(batch, part.kinds, nu, jnp.zeros(part.rows.shape[-1]))
+        guess = cold(lanes, _gathered(x, part.rows), kappa[part.rows])
+        return guess.sigma, guess.sharpness
+
+    found = [_by_chunk(batch, begin) for batch in plan.batches]
+    return Memory(*(_put_back(plan.agent, [each[k] for each in found], jnp.full(plan.agents, float(k))) for k in range(2)))
+
+
+def step(
+    plan: Plan, nu: Nu, v: Array, kappa: Array, x: Array, memory: Memory, *, offset: Array | float, precision: Precision
+) -> tuple[Array, Memory, Array]:
+    """Every agent's prox, over the rows of a state.
+
+    Args:
+        plan: the agents that have constraints; the rows of the others stay at v.
+        nu: the smoothing.
+        v: (rows, d) the point to stay near.
+        kappa: (rows,) how near.
+        x: (rows, d) where the last step ended.
+        memory: of the last step.
+        offset: added to ln f_i; one number, or one an agent.
+        precision: when to stop.
+
+    Returns:
+        (rows, d) the solution, the memory, and (rows,) the stiffness, NaN for rows that no constraint reads.
+    """
+    near, last, weight = _padded(v), _padded(x), _padded(kappa)
+    offset = jnp.broadcast_to(offset, memory.sigma.shape)
+
+    def answers(solver: Callable[..., Found], batch: Batch, part: Part, skip: Array | None = None) -> tuple[Array, ...]:
+        lanes = Lanes(batch, part.kinds, nu, offset[part.agents])
+        guess = Guess(_gathered(last, part.rows), memory.sigma[part.agents], memory.sharpness[part.agents])
+        given = {} if skip is None else {"skip": skip}
+        found = solver(lanes, _gathered(near, part.rows), weight[part.rows], guess, precision, **given)
+        return jnp.moveaxis(found.guess.y, 1, -1), found.stiffness, found.guess.sigma, found.guess.sharpness, found.done
+
+    found = []
+    for batch in plan.batches:
+        if precision.tolerance is None and len(batch.rows) > 1:
+            first = _by_chunk(batch, functools.partial(answers, solve_if_near))
+            found.append(_finish(batch, first, functools.partial(answers, solve)))
+        else:
+            found.append(_by_chunk(batch, functools.partial(answers, solve)))
+    y, stiffness, sigma, sharpness = ([each[k] for each in found] for k in range(4))
+    return (
+        _put_back(plan.row, y, v),
+        Memory(_put_back(plan.agent, sigma, memory.sigma), _put_back(plan.agent, sharpness, memory.sharpness)),
+        _put_back(plan.row, stiffness, jnp.full(len(kappa), jnp.nan)),
+    )
+
+
+def _padded(rows: Array) -> Array:
+    return jnp.concatenate([rows, jnp.ones_like(rows[:1])])
+
+
+def _gathered(state: Array, rows: Array) -> Array:
+    """(rows, d) at (n, A) → (n, d, A)."""
+    return jnp.moveaxis(state[rows], -1, 1)
+
+
+class Part(NamedTuple):
+    """Some agents of a batch, (A,), with their rows, (n, A), and constraints."""
+
+    agents: Array
+    rows: Array
+    kinds: tuple[Kind, ...]
+
+
+def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]) -> tuple[Array, ...]:
+    """What a function gives for every chunk, stacked."""
+    parts = Part(batch.agents, batch.rows, batch.kinds)
+    if len(batch.rows) == 1:
+        return tuple(leaf[None] for leaf in function(batch, jax.tree.map(lambda leaf: leaf[0], parts)))
+    return tuple(jax.lax.map(lambda part: function(batch, part), parts))
+
+
+def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[[Batch, Part, Array], tuple[Array, ...]]) -> tuple[Array, ...]:
+    """The answers of those who are not done, gathered into chunks of their own, so that nobody waits for them; `first`: all answers so far,
+    the last of which says who is done."""
+    chunks, width = batch.agents.shape
+    missing = ~first[-1].reshape(-1)
+    place = jnp.cumsum(missing.astype(jnp.int32))
+    total = place[-1]
+    order = jnp.zeros(chunks * width, jnp.int32)
+    order = order.at[jnp.where(missing, place - 1, chunks * width)].set(jnp.arange(chunks * width, dtype=jnp.int32), mode="drop")
+
+    def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        start, answers = at
+        mine = jax.lax.dynamic_slice(order, (start,), (width,))
+        # the last slice is moved back where it would reach beyond the end
+        spare = jnp.minimum(start, chunks * width - width) + jnp.arange(width, dtype=jnp.int32) >= total
+        chunk, lane = mine // width, mine % width
+        part = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[chunk, ..., lane], 0, -1), Part(batch.agents, batch.rows, batch.kinds))
+        chunk = jnp.where(spare, chunks, chunk)
+        found = list(solver(batch, part, spare))
+        found[0] = jnp.moveaxis(found[0], 1, 0)  # the agents first, as they are when indexed
+        found[1] = jnp.moveaxis(found[1], 1, 0)
+        y, stiffness, *numbers = answers
+        y = y.at[chunk, :, lane].set(found[0], mode="drop")
+        stiffness = stiffness.at[chunk, :, lane].set(found[1], mode="drop")
+        put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
+        return start + width, (y, stiffness, *put)
+
+    return jax.lax.while_loop(lambda at: at[0] < total, more, (jnp.asarray(0, jnp.int32), first))[1]
+
+
+def _put_back(where: Array, found: list[Array], others: Array) -> Array:
+    """The answers of all batches, each where it belongs; `others` where there is none."""
+    if not found:
+        return others
+    flat = jnp.concatenate([each.reshape(-1, *others.shape[1:]) for each in found])
+    answered = where < len(flat)
+    return jnp.where(answered.reshape(-1, *[1] * (others.ndim - 1)), flat[jnp.minimum(where, len(flat) - 1)], others)

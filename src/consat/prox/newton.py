@@ -1,0 +1,296 @@
+"""The saddle point of `consat.prox`, by Newton's method on both its equations, for the agents of one chunk.
+
+For a fixed σ the first equation is the gradient of a strongly convex function of y, and L(y(σ)) − σ falls in σ: Newton on both together,
+with a line search on the first and a bracket on the second, cannot miss. For ψ that are not concave the curvature is made positive where it
+is not, and the bracket still finds a stationary point.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from consat.prox.lanes import Expanded, Lanes, add_up, dot, solve_symmetric
+
+MOST_ITERATIONS = 200
+SHARPEN = 4.0
+"""Factor by which the soft minimum is sharpened each time its blunter version is solved."""
+LONGEST_STEP = 3.0
+"""σ rises by at most this much at a time where y answers to it: beyond, the linear model of y says nothing."""
+STRONGEST = 1e12
+"""Where the multiplier outweighs κ by this much, an agent already does all it can for its own constraints, and σ stays."""
+SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
+"""Parts of a step that a line search tries."""
+
+
+class Guess(NamedTuple):
+    """Where solvers stand: (n, d, A) their rows, (A,) ln of the multiplier, and (A,) the sharpness reached."""
+
+    y: Array
+    sigma: Array
+    sharpness: Array
+
+
+class Precision(NamedTuple):
+    """When to stop.
+
+    Attributes:
+        tolerance: of both equations: relative to the terms of the first, and on ln f of the second; if None, the first step that begins
+            within reach of the solution is the last, so that whoever begins there takes one.
+    """
+
+    tolerance: float | None
+
+
+class _Search(NamedTuple):
+    """As `Guess`, but (N, A) for y; the bracket of σ, and (n, A) the mean diagonal of ∇²f over the coordinates of each row."""
+
+    y: Array
+    sigma: Array
+    sharpness: Array
+    low: Array
+    high: Array
+    stiffness: Array
+    iterations: Array
+    done: Array
+
+
+class _Ahead(NamedTuple):
+    """Newton's step in y: (N, A) for the multiplier as it is, and what it gains for each unit that σ rises."""
+
+    descend: Array
+    follow: Array
+
+    def to(self, change: Array) -> Array:
+        """(N, A) the step in y for a change of σ."""
+        return self.descend + self.follow * jnp.where(change < 0, jnp.expm1(change), change)[None]
+
+
+class _Here(NamedTuple):
+    """Where solvers stand: L to second order, its diagonal, what σ cannot exceed, σ and e^σ, the two forces of the first equation, its
+    matrix, Newton's step, and whether y is settled for this σ to a fraction of what the second equation lacks."""
+
+    model: Expanded
+    diagonal: Array
+    ceiling: Array
+    sigma: Array
+    multiplier: Array
+    pull: Array
+    push: Array
+    matrix: Array
+    ahead: _Ahead
+    near: Array
+
+    def wanted(self, drop: Array) -> Array:
+        """(A,) the σ that solves both equations to first order; `drop`: what the step in y takes off L. It rises by no more than the linear
+        model is good for."""
+        gap, slope = self.model.level - self.sigma, self.model.slope
+        left, reach = gap + drop, jnp.maximum(-dot(slope, self.ahead.follow), 0.0)
+        most = jnp.minimum(left, jnp.log1p(jnp.maximum(left, 0.0) / (reach + jnp.finfo(left.dtype).tiny)))
+        return self.sigma + jnp.minimum(left / (1.0 + reach), jnp.maximum(LONGEST_STEP, most))
+
+
+class Found(NamedTuple):
+    """Answers.
+
+    Attributes:
+        guess: the solutions, where the next step begins.
+        stiffness: (n, A) the mean diagonal of ∇²f there over the coordinates of each row.
+        iterations: (A,) how many it took.
+        done: (A,) whether these are the answers.
+    """
+
+    guess: Guess
+    stiffness: Array
+    iterations: Array
+    done: Array
+
+
+def solve(
+    lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision, skip: Array | None = None
+) -> Found:  # fmt: skip
+    """The prox of the agents of a chunk.
+
+    Args:
+        lanes: their objectives.
+        v: (n, d, A) the points to stay near.
+        kappa: (n, A) > 0 how near.
+        guess: where to begin.
+        precision: when to stop.
+        skip: (A,) who needs no answer.
+    """
+    task = _Task.of(lanes, v, kappa, precision)
+    start = task.start(guess)
+    if skip is not None:
+        start = start._replace(done=skip)
+    return task.found(jax.lax.while_loop(lambda at: jnp.any(~at.done), task.step, start))
+
+
+def solve_if_near(lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision) -> Found:
+    """The first step of `solve` for those that are within reach of the solution, which is all that a `Precision` without tolerance asks of
+    them, at a fraction of its cost; the others are not done, and where they were."""
+    task = _Task.of(lanes, v, kappa, precision)
+    return task.found(task.one_step(task.start(guess)))
+
+
+class _Task(NamedTuple):
+    """What a solver has to do; as the arguments of `solve`, but (N, A) for v and κ."""
+
+    lanes: Lanes
+    v: Array
+    kappa: Array
+    shape: tuple[int, int]
+    precision: Precision
+
+    @classmethod
+    def of(cls, lanes: Lanes, v: Array, kappa: Array, precision: Precision) -> _Task:
+        n, d, count = v.shape
+        return cls(lanes, v.reshape(n * d, count), jnp.repeat(kappa, d, axis=0, total_repeat_length=n * d), (n, d), precision)
+
+    def start(self, guess: Guess) -> _Search:
+        count = self.v.shape[1]
+        infinity = jnp.full(count, jnp.inf, self.v.dtype)
+        nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int), jnp.zeros(count, bool)
+        return _Search(guess.y.reshape(self.v.shape), guess.sigma, guess.sharpness, -infinity, infinity, *nothing)
+
+    def found(self, at: _Search) -> Found:
+        return Found(Guess(at.y.reshape(*self.shape, -1), at.sigma, at.sharpness), at.stiffness, at.iterations, at.done)
+
+    def level(self, y: Array, sharpness: Array) -> Array:
+        return self.lanes.level(y.reshape(*self.shape, -1), sharpness)
+
+    def step(self, at: _Search) -> _Search:
+        """One step of Newton in every lane that is not done."""
+        here = self.look(at)
+        model, ahead, sigma, multiplier, near = here.model, here.ahead, here.sigma, here.multiplier, here.near
+        gap, ceiling = model.level - sigma, here.ceiling
+
+        # y alone, for this multiplier, until that much is settled to a fraction of the gap …
+        alone = jax.lax.cond(
+            jnp.any(~near & ~at.done), lambda: self.search(at, multiplier, ahead.descend), lambda: at.y + ahead.descend
+        )  # fmt: skip
+        # … then both at once, σ within a bracket that only certain signs may narrow
+        drop = dot(model.slope, ahead.descend)
+        certain = near & (jnp.abs(drop) <= 0.3 * jnp.abs(gap))
+        low = jnp.where(certain & (gap > 0), jnp.maximum(at.low, sigma), at.low)
+        high = jnp.where(certain & (gap < 0), jnp.minimum(at.high, sigma), at.high)
+        wanted = here.wanted(drop)
+        bracketed = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
+        wanted = jnp.minimum(jnp.where(bracketed, 0.5 * (low + high), wanted), ceiling)
+        together = at.y + ahead.to(wanted - sigma)
+
+        sharp = at.sharpness >= 1.0
+        met = (sigma >= ceiling - 1e-6) & (gap > 0)
+        done, last = at.done, near & sharp
+        if self.precision.tolerance is not None:
+            settled, equal = self.settled(at, here)
+            met |= equal
+            done, last = at.done | (settled & met & sharp), jnp.zeros_like(sharp)
+        sharpen = near & ((jnp.abs(gap) <= 3.0) | met) & ~sharp
+        moves, rises = ~done, near & ~done
+        tired = at.iterations + 1 >= MOST_ITERATIONS
+        return _Search(
+            y=jnp.where(moves[None], jnp.where(near[None], together, alone), at.y),
+            sigma=jnp.where(rises, wanted, jnp.where(at.done, at.sigma, sigma)),
+            sharpness=jnp.where(sharpen & moves, jnp.minimum(SHARPEN * at.sharpness, 1.0), at.sharpness),
+            low=jnp.where(sharpen, -jnp.inf, low),
+            high=jnp.where(sharpen, jnp.inf, high),
+            stiffness=jnp.where(at.done[None], at.stiffness, self.stiffness(here)),
+            iterations=jnp.where(at.done, at.iterations, at.iterations + 1),
+            done=done | last | tired,
+        )
+
+    def one_step(self, at: _Search) -> _Search:
+        """The first step, of those that are within reach of the solution already; the others are left as they are."""
+        here = self.look(at)
+        wanted = jnp.minimum(here.wanted(dot(here.model.slope, here.ahead.descend)), here.ceiling)
+        done = here.near & (at.sharpness >= 1.0)
+        return at._replace(
+            y=jnp.where(done[None], at.y + here.ahead.to(wanted - here.sigma), at.y),
+            sigma=jnp.where(done, wanted, at.sigma),
+            stiffness=self.stiffness(here),
+            done=done,
+        )
+
+    def look(self, at: _Search) -> _Here:
+        """What there is to know where solvers stand."""
+        model = self.lanes.expand(at.y.reshape(*self.shape, -1), at.sharpness)
+        diagonal = jnp.stack([model.bend[i, i] for i in range(len(at.y))])
+        mean = add_up(jnp.abs(diagonal)) / len(at.y)
+        ceiling = jnp.log(STRONGEST * (add_up(self.kappa) / len(at.y)) / (mean + jnp.finfo(at.y.dtype).tiny))
+        sigma = jnp.minimum(at.sigma, ceiling)
+        multiplier = jnp.exp(sigma)
+        pull, push = self.kappa * (at.y - self.v), multiplier[None] * model.slope
+        matrix, ahead = self.ahead(model, multiplier, pull + push, push)
+        gap = model.level - sigma
+        near = -dot(pull + push, ahead.descend) <= 0.2 * multiplier * jnp.maximum(1.0, 0.3 * jnp.abs(gap))
+        return _Here(model, diagonal, ceiling, sigma, multiplier, pull, push, matrix, ahead, near)
+
+    def stiffness(self, here: _Here) -> Array:
+        """(n, A) the mean diagonal of ∇²f over the coordinates of each row."""
+        bent = jnp.abs(here.diagonal + here.model.slope**2).reshape(*self.shape, -1)
+        return here.multiplier[None] * (add_up(jnp.moveaxis(bent, 1, 0)) / self.shape[1])
+
+    def ahead(self, model: Expanded, multiplier: Array, residual: Array, push: Array) -> tuple[Array, _Ahead]:
+        """The matrix of the first equation, (N, N, A), and Newton's step."""
+        kappa = jnp.eye(len(self.v))[:, :, None] * self.kappa[None]
+        matrix, right = kappa + multiplier[None, None] * model.bend, jnp.stack([-residual, -push], axis=1)
+        found, positive = solve_symmetric(matrix, right)
+        if not self.lanes.batch.convex:
+
+            def mended() -> Array:
+                if model.safe is not None:
+                    return solve_symmetric(kappa + multiplier[None, None] * model.safe, right)[0]
+                values, vectors = jnp.linalg.eigh(jnp.moveaxis(matrix, -1, 0))
+                values = jnp.maximum(jnp.abs(values), jnp.min(self.kappa, axis=0)[:, None])
+                return jnp.einsum("aij,aj,akj,kra->ira", vectors, 1.0 / values, vectors, right)
+
+            found = jnp.where(positive[None, None], found, jax.lax.cond(jnp.all(positive), lambda: found, mended))
+        return matrix, _Ahead(found[:, 0], found[:, 1])
+
+    def search(self, at: _Search, multiplier: Array, descend: Array) -> Array:
+        """Where along a step the function whose gradient the first equation is, is least."""
+
+        def worth(scale: Array) -> Array:
+            y = at.y + scale * descend
+            return 0.5 * add_up(self.kappa * (y - self.v) ** 2) + multiplier * self.level(y, at.sharpness)
+
+        scales = jnp.array(SCALES)
+        worths = jax.vmap(worth)(scales)
+        best = jnp.argmin(jnp.where(jnp.isnan(worths), jnp.inf, worths), axis=0)
+        return at.y + scales[best][None] * descend
+
+    def settled(self, at: _Search, here: _Here) -> tuple[Array, Array]:
+        """(A,) whether the first equation holds, and whether the second does, as far as float64 can tell."""
+        pull, push, slope = here.pull, here.push, here.model.slope
+        residual, gap = pull + push, here.model.level - here.sigma
+        eps, tolerance = 8 * jnp.finfo(at.y.dtype).eps, self.precision.tolerance or 0.0
+        rounding = eps * (jnp.abs(at.y) + jnp.abs(self.v))
+        blur = add_up(jnp.abs(jnp.moveaxis(here.matrix, 1, 0)) * rounding[:, None])
+        terms = jnp.sqrt(dot(pull, pull)) + jnp.sqrt(dot(push, push))
+        settled = jnp.sqrt(dot(residual, residual)) <= tolerance * terms + jnp.sqrt(dot(blur, blur))
+        return settled, jnp.abs(gap) <= tolerance + eps * jnp.abs(at.sigma) + dot(jnp.abs(slope), rounding)
+
+
+def cold(lanes: Lanes, v: Array, kappa: Array) -> Guess:
+    """Where to begin without a last solution: at v, with the multiplier that one step of Newton would want there, and with a soft minimum
+    so blunt that it sees no kink between the constraints at v.
+
+    Args:
+        lanes: the objectives.
+        v: (n, d, A).
+        kappa: (n, A).
+    """
+    tiny = jnp.finfo(v.dtype).tiny
+    there = lanes.violations(v)
+    used = there > -jnp.inf
+    spread = jnp.max(there, axis=0) - add_up(jnp.where(used, there, 0.0)) / lanes.count(there)
+    sharpness = 1.0 / jnp.maximum(lanes.nu.alpha * spread, 1.0)
+    model = lanes.expand(v, sharpness)
+    reach = add_up(model.slope**2 / jnp.repeat(kappa, v.shape[1], axis=0, total_repeat_length=len(model.slope)))
+    height = model.level
+    sigma = jnp.minimum(height, jnp.log1p(jnp.maximum(height, 0.0)) - jnp.log(jnp.maximum(reach, tiny)))
+    return Guess(v, sigma, sharpness)

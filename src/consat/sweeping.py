@@ -1,0 +1,338 @@
+"""`sweep`: many seeds and parameter values, as one computation where the protocol goes in rounds."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import os
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consat import __version__
+from consat.certificate import bounds
+from consat.errors import InvalidSettings
+from consat.estimates import Layout
+from consat.numerics import float64
+from consat.protocols import FLOWS, ROUNDS, with_gains
+from consat.runner import Prepared, number, run, scenario_of, settings_of, status_of, with_auxiliary
+from consat.scenario import Scenario, loads
+from consat.settings import Start
+from consat.simulate import Stop
+from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
+from consat.simulate.kernel import Weather, world_of
+from consat.simulate.rounds import PATIENCE, Rules, stillness
+from consat.team import Team
+
+SCHEMA = "consat.sweep/1"
+MOST_LISTED = 10_000
+"""Above this many runs the summary leaves them out; the CSV file lists all."""
+OF_A_RUN = ("loss", "sleep")
+"""Parameters that belong to a run rather than to the scenario."""
+MEASURED = ("satisfied_from", "margin", "smooth_margin", "rounds", "messages", "floats_sent")
+"""What is told of each run, and of each value in the mean."""
+
+
+class Sweep:
+    """Many runs.
+
+    Attributes:
+        summary: what ``consat sweep --json`` prints.
+        runs: of each run a row: the parameters' values, the seed, and what became of it.
+    """
+
+    def __init__(self, summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> None:
+        self.summary = dict(summary)
+        self.runs = list(runs)
+
+    def save(self, directory: str | os.PathLike[str]) -> list[Path]:
+        """Write sweep.json, sweep.csv (a line a run) and the figure sweep.png."""
+        target = Path(directory)
+        target.mkdir(parents=True, exist_ok=True)
+        (target / "sweep.json").write_text(json.dumps(self.summary, indent=1))
+        with (target / "sweep.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(self.runs[0]))
+            writer.writeheader()
+            writer.writerows({key: json.dumps(v) if isinstance(v, list | dict) else v for key, v in each.items()} for each in self.runs)
+        return [target / "sweep.json", target / "sweep.csv", self.plot(target / "sweep.png")]
+
+    def plot(self, path: str | os.PathLike[str]) -> Path:
+        """The figure: rounds to satisfaction, margin and success over the parameter; see `consat.views.spread`."""
+        from consat.views import spread
+
+        return spread.save(self.summary, self.runs, path)
+
+    def __str__(self) -> str:
+        from consat.views import words
+
+        return words.sweep(self.summary)
+
+
+def values(text: str) -> list[Any]:
+    """The values that ``v1,v2,…`` or ``a:b:n`` (n numbers from a to b) means; each is YAML, and may hold commas within brackets.
+
+    Raises:
+        InvalidSettings: a range that is none.
+    """
+    from consat.scenario.document import read
+
+    if text.count(":") == 2 and "[" not in text and "{" not in text:
+        low, high, count = text.split(":")
+        try:
+            found = np.linspace(float(low), float(high), int(count))
+        except ValueError:
+            raise InvalidSettings(f"{text!r} is no range; write FROM:TO:COUNT, such as 0.5:2:16") from None
+        return [float(f"{value:.12g}") for value in found]
+    parts, depth = [""], 0
+    for char in text:
+        depth += (char in "[{") - (char in "]}")
+        if char == "," and not depth:
+            parts.append("")
+        else:
+            parts[-1] += char
+    nodes = [read(part, "--over").root for part in parts]
+    return [None if node is None else node.plain for node in nodes]
+
+
+class _Combination(NamedTuple):
+    """One choice of the parameters."""
+
+    chosen: Mapping[str, Any]
+    ready: Prepared
+    weather: tuple[float, float]
+
+
+@float64
+def sweep(
+    team: Team | Scenario | str | os.PathLike[str],
+    over: Mapping[str, Sequence[Any]] | None = None,
+    *,
+    seeds: int | Sequence[int] = 1,
+    protocol: str | None = None,
+    estimates: Layout | None = None,
+    start: tuple[Any, Any] | None = None,
+    rounds: int | None = None,
+    until: float | None = None,
+    stop: Stop | None = None,
+    loss: float = 0.0,
+    sleep: float = 0.0,
+    auxiliary: float | None = None,
+    full: bool = False,
+    progress: Callable[[float, float], None] = lambda *_: None,
+) -> Sweep:
+    """Run a scenario with many seeds, and with every combination of some values of its parameters.
+
+    Protocols in rounds run as one computation, a lane a run, with exactly the rounds that each would take by itself (`consat.run` with the
+    same seed gives the same, to rounding); parameters that change shapes (``count``) make a computation each. Flows run one by one.
+
+    Args:
+        team: as in `consat.run`; parameters of the scenario can be swept only if there is one.
+        over: dotted paths into the scenario, as for ``--set``, or ``loss`` or ``sleep``, and of each the values to try.
+        seeds: how many, from the scenario's own on; or which.
+        protocol: as in `consat.run`, as is all that follows.
+        estimates: who holds copies.
+        start: the box of starts.
+        rounds: how many.
+        until: end of a flow, s.
+        stop: when to end earlier.
+        loss: probability that a message is lost.
+        sleep: probability that an agent skips a round.
+        auxiliary: radius of the auxiliary constraint.
+        full: whether to list every run in the summary, however many.
+        progress: called with the fraction of runs that have ended, and the share of these that satisfied every constraint.
+    """
+    began = time.perf_counter()
+    scenario = scenario_of(team)
+    over = {} if over is None else {path: list(options) for path, options in over.items()}
+    if empty := [path for path, options in over.items() if not options]:
+        raise InvalidSettings(f"no values are given for {empty[0]}; give some, such as {empty[0]}=1,2,3")
+    given = {"protocol": protocol, "estimates": estimates, "start": start, "seed": None, "smoothing": None}
+    asked = _Asked(scenario, given, rounds, until, stop, loss, sleep, auxiliary)
+    first = scenario.settings.start.seed
+    numbers = list(range(first, first + seeds)) if isinstance(seeds, int) else [int(seed) for seed in seeds]
+    if not numbers:
+        raise InvalidSettings("there are no seeds; give at least one")
+    combinations = list(asked.combinations(over))
+    kinds = {each.ready.settings.protocol.kind for each in combinations}
+    if kinds & FLOWS.keys():
+        rows = list(asked.one_by_one(combinations, numbers, progress))
+    else:
+        rows = asked.together(combinations, numbers, progress)
+    settings = combinations[0].ready.settings
+    summary = {
+        "schema": SCHEMA,
+        "scenario": scenario.name,
+        "version": __version__,
+        "protocol": "/".join(sorted(map(str, kinds))),
+        "estimates": settings.protocol.estimates,
+        "seeds": [numbers[0], len(numbers)] if numbers == list(range(numbers[0], numbers[0] + len(numbers))) else numbers,
+        "over": over,
+        "count": len(rows),
+        "groups": [_told({path: each.chosen[path] for path in over}, rows[k * len(numbers) : (k + 1) * len(numbers)])
+                   for k, each in enumerate(combinations)],
+        "runs": rows if full or len(rows) <= MOST_LISTED else None,
+        "seconds": round(time.perf_counter() - began, 4),
+    }  # fmt: skip
+    return Sweep(summary, rows)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What all runs share."""
+
+    scenario: Scenario
+    given: Mapping[str, Any]
+    rounds: int | None
+    until: float | None
+    stop: Stop | None
+    loss: float
+    sleep: float
+    auxiliary: float | None
+
+    def combinations(self, over: Mapping[str, Sequence[Any]]) -> Iterator[_Combination]:
+        """Every combination of the values, the last path's values changing fastest."""
+        of_scenario = [path for path in over if path not in OF_A_RUN]
+        if of_scenario and not self.scenario.text:
+            raise InvalidSettings(f"{of_scenario[0]} is a path into a scenario, but this team has none that a file could hold")
+        made: dict[str, Prepared] = {}
+        for options in itertools.product(*over.values()):
+            chosen = dict(zip(over, options, strict=True))
+            overrides = [f"{path}={json.dumps(chosen[path])}" for path in of_scenario]
+            if (key := json.dumps(overrides)) not in made:
+                made[key] = self._prepared(overrides)
+            weather = tuple(float(chosen.get(name, getattr(self, name))) for name in OF_A_RUN)
+            if not all(0 <= value < 1 for value in weather):
+                raise InvalidSettings(f"loss is {weather[0]} and sleep is {weather[1]}, but both must be probabilities below 1")
+            yield _Combination(chosen, made[key], weather)  # type: ignore[arg-type]
+
+    def _prepared(self, overrides: Sequence[str]) -> Prepared:
+        scenario = loads(self.scenario.text, self.scenario.source, overrides) if overrides else self.scenario
+        if self.auxiliary is not None:
+            scenario = with_auxiliary(scenario, self.auxiliary)
+        settings = settings_of(scenario.settings, self.given)
+        kind = settings.protocol.kind
+        if kind not in FLOWS and kind not in ROUNDS:
+            raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
+        if (kind in FLOWS and (self.rounds or self.loss or self.sleep)) or (kind in ROUNDS and self.until):
+            raise InvalidSettings(
+                f"protocol {kind} is none to which all of these settings mean anything: until is for flows, the rest for rounds"
+            )
+        return Prepared.of(scenario.team, settings)
+
+    def together(
+        self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]
+    ) -> list[dict[str, Any]]:
+        """All runs in rounds: a computation for each shape."""
+        batches: dict[Any, list[tuple[int, Lane]]] = defaultdict(list)
+        protocols = {}
+        for k, combination in enumerate(combinations):
+            kind = str(combination.ready.settings.protocol.kind)
+            case = self._case(combination)
+            key = (kind, like(case))
+            protocols[key] = ROUNDS[kind]()
+            box = combination.ready.settings.start.box
+            for n, seed in enumerate(seeds):
+                first = combination.ready.first(Start(box=box, seed=seed))
+                batches[key].append((k * len(seeds) + n, Lane(case, first, seed)))
+        outcomes: dict[int, Outcome] = {}
+        total, ended = len(combinations) * len(seeds), 0
+        for key, lanes in batches.items():
+
+            def told(done: float, share: float, before: int = ended, count: int = len(lanes)) -> None:
+                progress((before + done * count) / total, share)
+
+            found = simulate_batch(protocols[key], [lane for _, lane in lanes], told)
+            outcomes |= {place: outcome for (place, _), outcome in zip(lanes, found, strict=True)}
+            ended += len(lanes)
+        return [
+            {**combination.chosen, "seed": seed, **_row(combination.ready, outcomes[k * len(seeds) + n])}
+            for k, combination in enumerate(combinations)
+            for n, seed in enumerate(seeds)
+        ]
+
+    def _case(self, combination: _Combination) -> Case:
+        ready = combination.ready
+        asked, nu = ready.settings.protocol, ready.schedule.final
+        protocol = ROUNDS[str(asked.kind)]()
+        gains = {
+            key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None
+        }
+        loss, sleep = combination.weather
+        world = world_of(ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None)
+        default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
+        rules = Rules(
+            end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,
+            still=stillness(ready.size.length, ready.enough),
+            earliest=protocol.earliest(world.everyone), hopeless=ready.hopeless, enough=ready.enough,
+        )  # fmt: skip
+        return Case(world, gains, rules)
+
+    def one_by_one(
+        self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]
+    ) -> Iterator[dict[str, Any]]:
+        """All runs, each by itself."""
+        satisfied, total = 0, len(combinations) * len(seeds)
+        for k, (combination, seed) in enumerate(itertools.product(combinations, seeds)):
+            ready, (loss, sleep) = combination.ready, combination.weather
+            scenario = Scenario(self.scenario.name, ready.team, ready.settings, "", self.scenario.source)
+            result = run(
+                scenario,
+                seed=seed,
+                rounds=self.rounds,
+                until=self.until,
+                stop=self.stop,
+                loss=loss,
+                sleep=sleep,
+                agents="none",
+                record=False,
+            )
+            told = result.summary
+            since = told["satisfied_from"]["round"] if told["rounds"] is not None else told["satisfied_from"]["time"]
+            satisfied += told["status"] == "satisfied"
+            progress((k + 1) / total, satisfied / (k + 1))
+            measured = {name: since if name == "satisfied_from" else told[name] for name in MEASURED}
+            yield {**combination.chosen, "seed": seed, **{key: told[key] for key in ("status", "verdict", "ending")}, **measured}
+
+
+def _row(ready: Prepared, outcome: Outcome) -> dict[str, Any]:
+    """What became of one run, in the words of ``run --json``."""
+    tally, margin = outcome.tally, number(outcome.tally.margin)
+    good = margin is not None and margin > 0
+    verdict = "feasible" if good else bounds(ready.team, outcome.positions, ready.schedule.final).verdict
+    moved = tally.drift if tally.done >= 10 else np.inf
+    return {
+        "status": status_of(outcome.ending, moved, margin, verdict, ready.size.length),
+        "verdict": verdict,
+        "ending": outcome.ending,
+        "satisfied_from": tally.last_bad + 1 if tally.last_bad < tally.done else None,
+        "margin": margin,
+        "smooth_margin": number(tally.smooth_margin),
+        "rounds": tally.done,
+        "messages": tally.messages,
+        "floats_sent": tally.floats,
+    }
+
+
+def _told(chosen: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Mean and spread over the runs of one combination."""
+    return {
+        "values": dict(chosen),
+        "runs": len(rows),
+        "success": sum(row["status"] == "satisfied" for row in rows) / len(rows),
+        **{name: _spread([row[name] for row in rows if row[name] is not None]) for name in MEASURED},
+    }
+
+
+def _spread(found: Sequence[float]) -> dict[str, float] | None:
+    """Of the runs of which there is a number; None if of none."""
+    if not found:
+        return None
+    low, median, high = np.quantile(found, [0.1, 0.5, 0.9])
+    return {"count": len(found), "mean": float(np.mean(found)), "std": float(np.std(found)), "min": float(min(found)), "10 %": float(low),
+            "median": float(median), "90 %": float(high), "max": float(max(found))}  # fmt: skip
