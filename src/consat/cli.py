@@ -117,6 +117,10 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option(
     "--resume", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Go on with a run that kept checkpoints there."
 )
+@click.option("--processes", type=click.IntRange(min=1), metavar="K", help="Run in K processes on this machine.")
+@click.option("--coordinator", metavar="HOST:PORT", help="Join others: where process 0 listens; see docs/cluster.md.")
+@click.option("--process", type=click.IntRange(min=0), metavar="I", help="Number of this process among them, from 0.")
+@click.option("--of", type=click.IntRange(min=1), metavar="K", help="How many they are.")
 @click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @json_option
@@ -125,6 +129,8 @@ def run(
 ) -> int:  # fmt: skip
     """Run the distributed protocol."""
     _cache_compilations()
+    if not _meet(*(settings.pop(name) for name in ("processes", "coordinator", "process", "of"))):
+        quiet, as_json = True, False  # process 0 speaks for all
     out = settings["out"] = resume or settings["out"]
     _fit_together(scenario, resume, out, settings["checkpoint"])
     loaded = None if scenario is None else _load(scenario, overrides)
@@ -138,7 +144,7 @@ def run(
             result = runner.run(loaded, full=full, progress=progress, **settings)
     if settings["auxiliary"] is not None:
         _say_auxiliary(settings["auxiliary"], result.binding("auxiliary"))
-    if out is not None:
+    if result.summary["result"] is not None and out is not None:
         figures = result.plot(out)
         if not (quiet or as_json):
             _say(f"written: {', '.join(str(path) for path in (out / 'result.nc', *figures))}")
@@ -149,6 +155,20 @@ def run(
     if result.summary["ending"] == "interrupted":
         return INTERRUPTED
     return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+
+
+def _meet(processes: int | None, coordinator: str | None, process: int | None, of: int | None) -> bool:
+    """Join the others, or start them; whether this process is the one that speaks."""
+    if processes is None and not {coordinator, process, of} - {None} and "CONSAT_COORDINATOR" not in os.environ:
+        return True
+    from consat import processes as together
+
+    where = together.asked(coordinator, process, of, os.environ)
+    if where is not None:
+        together.join(*where)
+    elif processes is not None and processes > 1:
+        sys.exit(together.launch(sys.argv[1:], processes))
+    return where is None or where[1] == 0
 
 
 def _fit_together(scenario: str | None, resume: Path | None, out: Path | None, checkpoint: float | None) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -162,6 +163,8 @@ def _start(
     until, rounds, loss, sleep, rate, speed = (given[key] for key in ("until", "rounds", "loss", "sleep", "rate", "speed"))
     default = "never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied"
     options: dict[str, Any] = {"stop": given["stop"] or default, "progress": progress}
+    if jax.process_count() > 1 and (kind in FLOWS or (files is not None and files.checkpoints(about) is not None)):
+        raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
     keep = _Keep(given["agents"], given["record"], given["every"], files, about)
     if kind in FLOWS:
         _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
@@ -260,7 +263,7 @@ class _Keep:
     def options(self, team: Team, copies: Estimates, clock: str) -> dict[str, Any]:
         """Arguments of `simulate_rounds` and `simulate_flow`."""
         choice = Choice.of(team, copies, self.agents, self.record, self.every)
-        if self.files is None:
+        if self.files is None or jax.process_index() > 0:  # process 0 writes for all
             return {"choice": choice}
         return {"choice": choice, "sink": self.files.sink(team, copies, choice, clock), "checkpoint": self.files.checkpoints(self.about)}
 
@@ -272,7 +275,7 @@ def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simula
     options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
     trace = simulate(ready, **options)
     summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
-    if keep.files is not None:
+    if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
     return Result(summary, trace=trace, team=team, scenario=scenario.text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -104,6 +104,10 @@ class Engine(Protocol):
 
     def look(self, state: Any) -> Kept:
         """What is recorded of the state as it is."""
+        ...
+
+    def agree(self, stop: bool) -> bool:
+        """Whether any process wants to stop."""
         ...
 
 
@@ -250,6 +254,9 @@ class OneProcess:
     def positions(self, state: Now) -> np.ndarray:
         return np.array(state.body)
 
+    def agree(self, stop: bool) -> bool:
+        return stop
+
     def look(self, state: Now) -> Kept:
         kept = _compiled()[2](self._world, self._chosen, state)
         return Kept(*map(np.array, kept))
@@ -354,12 +361,21 @@ def simulate_rounds(
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     weather = weather or Weather()
-    world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body)
     choice = choice or Choice.of(team, copies, estimates=record)
-    engine = OneProcess(protocol, world, first, weather.seed, choice, HOLD if stop == "satisfied" else None)
+    hold = stop == "satisfied"
+    if jax.process_count() > 1:
+        from consat.simulate.cluster import ManyProcesses
+
+        together = ManyProcesses(
+            team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold
+        )
+        engine, everyone = cast(Engine, together), together.world.everyone
+    else:
+        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body)
+        engine, everyone = OneProcess(protocol, world, first, weather.seed, choice, HOLD if hold else None), world.everyone
     rules = Rules(
         end=PATIENCE if rounds is None else rounds, stop=stop, still=stillness(size.length, enough),
-        earliest=protocol.earliest(world.everyone),
+        earliest=protocol.earliest(everyone),
         hopeless=hopeless, enough=enough,
     )  # fmt: skip
     problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
@@ -454,7 +470,7 @@ def conduct(
             state, chunk = engine.advance(state, tally.done, count, tally.streak, sink.every)
             _record(sink, choice, tally, chunk)
             found = rules.ending(tally, functools.partial(engine.positions, state))
-            if found is None and (stopped() or not told(progress, tally.done / rules.end, tally.margin)):
+            if engine.agree(not told(progress, tally.done / rules.end, tally.margin) or stopped()) and found is None:
                 found = "interrupted"
             if found is not None:
                 ending = found

@@ -1,0 +1,5 @@
+"""``python -m consat``."""
+
+from consat.cli import main
+
+main()
