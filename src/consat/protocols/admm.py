@@ -11,6 +11,8 @@ slowly towards the stiffness of its own f_i, and fall towards it only once it kn
 is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
 changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the
 negative curvature of f_i the step would have no minimum.
+
+The points begin where the team's places are, however far out the bodies start: any would do, and near ones are rounds away.
 """
 
 from __future__ import annotations
