@@ -59,7 +59,7 @@ class Estimates:
         own: (N,) the row of each agent's own position.
         edges: (E, 2) directed edges (receiver, sender) between copies of the same position on linked agents, by receiver.
         cluster: (N,) the cluster of each agent.
-        links: (L, 2) the links that carry messages.
+        links: (L, 2) the links that carry messages: those whose ends share a copy.
     """
 
     layout: Layout
@@ -80,7 +80,8 @@ class Estimates:
         pairs = holders(team, cluster) if layout == "local" else _everyone(cluster)
         links = cluster_links(team, cluster)
         own = np.flatnonzero(pairs[:, 0] == pairs[:, 1]).astype(np.int32)
-        return cls(layout, pairs[:, 0], pairs[:, 1], own, _shared(pairs, links, team.count), cluster, links)
+        edges = _shared(pairs, links, team.count)
+        return cls(layout, pairs[:, 0], pairs[:, 1], own, edges, cluster, _used(pairs[edges, 0], team.count))
 
     @property
     def count(self) -> int:
@@ -121,3 +122,10 @@ def _shared(pairs: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
     sender = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     edges = np.stack([receiver, sender], axis=1)[keys[sender] == wanted]
     return edges[np.lexsort((edges[:, 1], edges[:, 0]))].astype(np.int32)
+
+
+def _used(talkers: np.ndarray, count: int) -> np.ndarray:
+    """(L, 2) the links, i < j, each once, between the agents at both ends of (E, 2) edges."""
+    keys = np.unique(talkers[:, 0].astype(np.int64) * count + talkers[:, 1])
+    links = np.stack([keys // count, keys % count], axis=1).astype(np.int32)
+    return links[links[:, 0] < links[:, 1]]
