@@ -59,7 +59,7 @@ class Estimates:
         own: (N,) the row of each agent's own position.
         edges: (E, 2) directed edges (receiver, sender) between copies of the same position on linked agents, by receiver.
         cluster: (N,) the cluster of each agent.
-        links: (L, 2) the links that carry messages.
+        links: (L, 2) the links that carry messages: those whose ends share a copy.
     """
 
     layout: Layout
@@ -80,7 +80,8 @@ class Estimates:
         pairs = holders(team, cluster) if layout == "local" else _everyone(cluster)
         links = cluster_links(team, cluster)
         own = np.flatnonzero(pairs[:, 0] == pairs[:, 1]).astype(np.int32)
-        return cls(layout, pairs[:, 0], pairs[:, 1], own, _shared(pairs, links, team.count), cluster, links)
+        edges = _shared(pairs, links, team.count)
+        return cls(layout, pairs[:, 0], pairs[:, 1], own, edges, cluster, _used(pairs[edges, 0], team.count))
 
     @property
     def count(self) -> int:
@@ -130,3 +131,10 @@ def _both_ways(links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     keys = np.sort(np.concatenate([low * count + high, high * count + low]))
     here, there = np.divmod(keys, max(count, 1))
     return here.astype(np.int32), there.astype(np.int32)
+
+
+def _used(talkers: np.ndarray, count: int) -> np.ndarray:
+    """(L, 2) the links, i < j, each once, between the agents at both ends of (E, 2) edges."""
+    keys = np.unique(talkers[:, 0].astype(np.int64) * count + talkers[:, 1])
+    links = np.stack([keys // count, keys % count], axis=1).astype(np.int32)
+    return links[links[:, 0] < links[:, 1]]

@@ -169,23 +169,44 @@ def test_one_that_left_comes_back(mode: str) -> None:
 
 
 def test_news_of_a_departure_passes_over_relays() -> None:
-    """a1 must stay near a4, three links away; all on the way hold a copy of its position, and must hear that it has left."""
+    """a1 must stay near a3, two links away; a2, which relays, wants nothing of a3. Both must hear that it has left."""
     scenario = loads("""
 consat: 1
 agents:
-  - {id: a1, constraints: [{kind: near, agent: a4, radius: 1}, {kind: within, center: [0, 0], radius: 3}]}
-  - {id: a2, constraints: [{kind: within, center: [1, 0], radius: 1}]}
-  - {id: a3, constraints: [{kind: near, agent: a2, radius: 1}]}
-  - {id: a4, constraints: [{kind: near, agent: a3, radius: 1}]}
+  - {id: a1, constraints: [{kind: near, agent: a3, radius: 1}]}
+  - {id: a2, constraints: [{kind: near, agent: a1, radius: 1}]}
+  - {id: a3, constraints: [{kind: within, center: [0, 0], radius: 1}]}
 communication: {graph: line}
 smoothing: {nu_alpha: 5, nu_beta: 5}
 """)
     team = Rehearsal(split(scenario, run="relays"), Manner("admm"), Air(Conditions(loss=0.3)))
     team.start()
-    team.run(2.0)
-    team.runners["a4"].leave()
+    team.run(1.0)
+    team.runners["a3"].leave()
+    team.run(1.0)
+    assert {event["id"] for event in events(team, "left") if event["agents"] == ["a3"]} == {"a1", "a2"}
+
+
+def test_links_that_carry_nothing_shorten_no_way() -> None:
+    """In a ring whose tasks lie along a line, the ends of the line are linked, but share no copy and hence tell each other nothing: what
+    one knows reaches the other over three links."""
+    agents = [f"  - {{id: a{i}, constraints: [{{kind: near, agent: a{i + 1}, radius: 1}}]}}" for i in (1, 2, 3)]
+    text = "\n".join(
+        ["consat: 1", "agents:", *agents, "  - {id: a4}", "communication: {graph: ring}", "smoothing: {nu_alpha: 5, nu_beta: 5}"]
+    )
+    assert {part.hops for part in split(loads(text)).values()} == {3}
+
+
+def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
+    team = rehearse(Manner("admm", rate=50.0))
     team.run(3.0)
-    assert {event["id"] for event in events(team, "left") if event["agents"] == ["a4"]} == {"a1", "a2", "a3"}
+    assert all(runner.station.satisfied for runner in team.runners.values())
+    team.kill("a3")
+    team.run(2.0)
+    assert not any(runner.station.satisfied for runner in team.runners.values())
+    team.start("a3")
+    team.run(3.0)
+    assert all(runner.station.satisfied for runner in team.runners.values())
 
 
 def test_every_agent_learns_that_all_are_satisfied() -> None:

@@ -37,9 +37,10 @@ def test_messages_pass_both_ways_whatever_the_agents_are_called(a: str, b: str, 
         first, second = agents.pair(a, b, reliable=reliable)
         for sender, receiver, source, destination in ((first, second, a, b), (second, first, b, a)):
             sent = [letter(source, destination, number) for number in range(20)]
-            for payload in sent:
-                sender.send(destination, payload)
-            assert gathered(receiver, 20) == sent
+            for burst in [sent] if reliable else [[payload] for payload in sent]:  # where full queues drop, a burst may lose some
+                for payload in burst:
+                    sender.send(destination, payload)
+                assert gathered(receiver, len(burst)) == burst
         assert (first.alive(), second.alive()) == ({b}, {a})
 
 

@@ -152,7 +152,9 @@ class RoundCore:
         return self._begin(self.protocol, self.solver, first)
 
     def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
-        now, outbox, x, margin, known = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived), moment.round)
+        now, outbox, x, margin, known = self._turn(
+            self.protocol, self._layout, self.solver, state, (inbox, arrived, moment.fresh), moment.round
+        )
         return now, np.asarray(outbox), Look(np.asarray(x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
 
     def among(self, gone: Collection[str]) -> RoundCore:
@@ -226,11 +228,11 @@ def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
 
 
 def _turn(
-    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array], round_: Array
+    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], round_: Array
 ) -> tuple[_Now, Array, Array, Array, Array]:
-    inbox, arrived = heard
+    inbox, arrived, fresh = heard
     state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
-    ages = agreement.hear(now.ages, inbox[:, -1], arrived)
+    ages = known_of(agreement.hear(now.ages, inbox[:, -1], arrived), fresh)
     state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))
     ages, told = agreement.speak(ages, state.x, solver)
     outbox = jnp.concatenate(
@@ -238,6 +240,11 @@ def _turn(
         axis=1,
     )
     return _Now(state, ages), outbox, state.x, solver.margin(state.x), agreement.known(ages, solver)
+
+
+def known_of(ages: agreement.Ages, fresh: Array | np.ndarray) -> agreement.Ages:
+    """Of a neighbour that has fallen silent nothing is known."""
+    return ages._replace(heard=jnp.where(fresh, ages.heard, 0.0))
 
 
 @functools.cache

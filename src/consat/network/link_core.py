@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.alone import Alone, ends
-from consat.network.core import LARGEST, Core, Kept, Look, Moment
+from consat.network.core import LARGEST, Core, Kept, Look, Moment, known_of
 from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.protocols import agreement
@@ -129,7 +129,7 @@ def _turn(
     pull = state.x / h + links.sum((k2 + spring)[:, None] * state.there) - z
     x, memory, _ = solver.prox(pull / stiff[:, None], stiff / k1, state.x, state.memory)
     force = state.force + (h * kappa)[:, None] * (links.at(x) - state.there)
-    ages, told = agreement.speak(state.ages, x, solver)
+    ages, told = agreement.speak(known_of(state.ages, moment.fresh), x, solver)
     state = state._replace(x=x, force=force, memory=memory, ages=ages)
     outbox = jnp.concatenate([links.at(x), force, state.adopted[:, None], told[:, None]], axis=1)
     assert outbox.shape[1] == 2 * d + 2
