@@ -24,7 +24,7 @@ from consat.conic import normalised, units
 from consat.graphs import clusters
 from consat.levels import radii, with_tangents
 from consat.numerics import float64
-from consat.objective import Nu, Objective, weigh
+from consat.objective import Nu, Objective, evaluate, weigh
 from consat.quadratics import Expansion, Floats, Ints, expand, shape_of
 from consat.reference import middle
 from consat.team import Team
@@ -34,7 +34,11 @@ Verdict = Literal["feasible", "infeasible", "undecided"]
 RUNGS = 4.0 ** np.arange(0, 7)
 """ν times the scale of ψ: from weights that see every constraint to those that see only the worst."""
 LARGE = 200_000
-"""Beyond so many coordinates only every third rung is tried."""
+"""Beyond so many coordinates a team is certified by the part of it that lies about its worst constraint: …"""
+STEPS = 8
+"""… so many constraints away, …"""
+MOST_TAKEN = 2000
+"""… or when there are so many agents."""
 BLEND = 1e-3
 """How much of the softest weights every other rung keeps: underflowed weights leave agents without curvature."""
 REFINEMENT = 4.0 ** np.arange(0, 8)
@@ -85,6 +89,8 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
     x = np.asarray(positions, dtype=float)
     if not len(team.owner):
         return Certificate(np.inf, None, np.zeros(0), "feasible", np.zeros(0, dtype=np.intp), np.full((team.count, 2), np.inf))
+    if x.size > LARGE and np.isfinite(x).all():
+        return _about_the_worst(team, x, nu, refine)
     with np.errstate(over="ignore", invalid="ignore"):
         model = expand(team, x) if np.isfinite(x).all() else None
         if model is None or not np.isfinite(model.value).all():
@@ -99,6 +105,34 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
     order = heavy[np.argsort(-proof.best[heavy], kind="stable")]
     each = np.stack([proof.margins, proof.upper], axis=1)
     return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, verdict, order, each)
+
+
+def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Certificate:
+    """Certify a large team by a part of it: what bounds the margin of some of the constraints bounds that of all."""
+    values = np.asarray(evaluate(Objective.at_positions(team), jnp.asarray(x)))
+    if not np.isfinite(values).all():
+        return Certificate(-np.inf, None, np.zeros(len(values)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+    mine = np.zeros(team.count, dtype=bool)
+    mine[team.owner[int(np.argmin(values))]] = True
+    for _ in range(STEPS):
+        if np.count_nonzero(mine) > MOST_TAKEN:
+            break
+        for family in team.families:
+            mine[family.agents[mine[family.agents].any(axis=1)]] = True
+    agents = np.flatnonzero(mine)
+    part, numbers = team.part(agents)
+    found = bounds(part, x[agents], nu, refine)
+    lower, upper = float(values.min()), found.upper
+    upper = None if upper is None else max(upper, lower)
+    multipliers = np.zeros(len(values))
+    multipliers[numbers] = found.multipliers
+    cluster = clusters(team)
+    each = np.full((int(cluster.max()) + 1, 2), np.inf)
+    np.minimum.at(each[:, 0], cluster[team.owner], values)
+    own = clusters(part)
+    each[cluster[agents[np.unique(own, return_index=True)[1]]], 1] = found.clusters[:, 1]
+    verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper is not None and upper <= 0 else "undecided"
+    return Certificate(lower, upper, multipliers, verdict, numbers[found.binding], each)
 
 
 class _Proof:
@@ -136,8 +170,7 @@ class _Proof:
     def ladder(self, nu: Nu | None, multipliers: Floats | None) -> None:
         """Weights at x̂ itself."""
         soft = self.weights(self.model.value, 1.0 / self.psi)
-        rungs = RUNGS if self.model.size <= LARGE else RUNGS[::3]
-        candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in rungs]
+        candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in RUNGS]
         if nu is not None:
             own = np.asarray(weigh(Objective.at_positions(self.team), jnp.asarray(self.model.at), nu)[1])
             candidates.append(normalised(np.where(self.concave, own, 0.0), self.group, self.count))

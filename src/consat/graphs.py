@@ -102,10 +102,11 @@ def hops(count: int, links: np.ndarray) -> int:
 
 def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How many links each agent, in the order of a breadth-first search, is from the start in its component; and that order."""
-    root = np.stack([np.full(len(starts), count), starts], axis=1)  # one search from all starts, as if they hung on one more agent
-    edges = np.concatenate([links, root])
-    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count + 1, count + 1)).tocsr()
-    order, parent = breadth_first_order(graph, count, directed=False)
+    # one search from all starts, as if they hung on one more agent
+    here = np.concatenate([links[:, 0], links[:, 1], np.full(len(starts), count, dtype=links.dtype)])
+    there = np.concatenate([links[:, 1], links[:, 0], starts.astype(links.dtype)])
+    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(count + 1, count + 1)).tocsr()
+    order, parent = breadth_first_order(graph, count, directed=True)
     place = np.empty(count + 1, dtype=np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     above = place[np.maximum(parent[order], 0)]

@@ -80,13 +80,14 @@ class Groups:
         device = jnp.asarray(group)
         sizes = np.bincount(group, minlength=count)
         width = int(sizes.max(initial=0))
-        if count * width == len(group) and np.all(group[1:] >= group[:-1]):
+        rising = bool(np.all(group[1:] >= group[:-1]))
+        if rising and count * width == len(group):
             return cls(device, None, count, width, padded=True)
-        order = np.argsort(group, kind="stable").astype(np.int32)
+        order = (np.arange(len(group)) if rising else np.argsort(group, kind="stable")).astype(np.int32)
         if count * width > PADDING_LIMIT * max(len(group), count):
             return cls(device, jnp.asarray(order), count, width, padded=False)
         index = np.full((count, width), len(group), dtype=np.int32)
-        ranked = group[order]
+        ranked = group if rising else group[order]
         index[ranked, np.arange(len(group)) - (np.cumsum(sizes) - sizes)[ranked]] = order
         return cls(device, jnp.asarray(index), count, width, padded=True)
 

@@ -191,6 +191,12 @@ class Objective:
 
 
 @jax.jit
+def evaluate(observer: Objective, x: Array) -> Array:
+    """(M,) every ψ_ik at one formation, compiled as one program."""
+    return observer.psi(x)
+
+
+@jax.jit
 def weigh(observer: Objective, x: Array, nu: Nu) -> tuple[Array, Array]:
     """(M,) every ψ_ik and (M,) λ_ik at one formation, compiled as one program."""
     return observer.psi(x), observer.multipliers(x, nu)

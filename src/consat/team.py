@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from consat.constraints.record import OWNER, Constraint, Number
 from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
-from consat.family import Counted, Family, Joined, Part, assemble, distinct
+from consat.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.groups import Expansion, Group, faults_of, stems_clash
 from consat.numerics import float64
 from consat.parameters import Path, checked, vector
@@ -139,6 +139,37 @@ class Team:
         team.__dict__.pop("constraints_per_agent", None)
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
+
+    def part(self, agents: np.ndarray) -> tuple[Team, np.ndarray]:
+        """The team of some of the agents, given by their places in ascending order, with the constraints and links that only involve them;
+        and the (M',) places that its constraints have in this one."""
+        place = np.full(self.count, -1, dtype=np.int32)
+        place[agents] = np.arange(len(agents), dtype=np.int32)
+        parts, kept = [], [np.zeros(0, dtype=np.int32)]
+        for family in self.families:
+            inside = np.flatnonzero((place[family.agents] >= 0).all(axis=1))
+            number = family.number[inside]
+            kept.append(number)
+            parts.append(
+                Part(
+                    kind=family.kind,
+                    psi=family.psi,
+                    agents=place[family.agents[inside]],
+                    owner=place[family.owner[inside]],
+                    parameters={key: value[inside] for key, value in family.parameters.items()},
+                    weight=family.weight[inside],
+                    names=Chosen(self.names, number),
+                    sources=None if family.sources is None else Chosen(family.sources, inside),
+                    turn=number,
+                )  # fmt: skip
+            )
+        team = copy.copy(self)
+        team.__dict__.pop("constraints_per_agent", None)
+        team.ids, team.starts, team.members, team.around = Chosen(self.ids, agents), self.starts[agents], None, None
+        team.families, team.owner, team.names = assemble([part for part in parts if len(part.owner)])
+        links = place[self.links]
+        team.links = links[(links >= 0).all(axis=1)]
+        return team, np.sort(np.concatenate(kept))
 
     @property
     def count(self) -> int:

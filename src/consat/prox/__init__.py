@@ -28,6 +28,10 @@ from consat.prox.newton import MOST_ITERATIONS, STRONGEST, Found, Guess, Precisi
 __all__ = ["MOST_ITERATIONS", "SMALL_TEAM", "STRONGEST", "Guess", "Memory", "Plan", "Precision", "buckets", "recall", "step"]
 
 
+MANY = 16
+"""Of so many chunks or more two are worked on at a time: what does not wait for one another runs on cores of its own."""
+
+
 class Memory(NamedTuple):
     """What the solver of each agent keeps for its next step, (N,): ln of the multiplier, and the sharpness reached."""
 
@@ -113,7 +117,12 @@ def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]
     parts = Part(batch.agents, batch.rows, batch.kinds)
     if len(batch.rows) == 1:
         return tuple(leaf[None] for leaf in function(batch, jax.tree.map(lambda leaf: leaf[0], parts)))
-    return tuple(jax.lax.map(lambda part: function(batch, part), parts))
+    if len(batch.rows) < MANY:
+        return tuple(jax.lax.map(lambda part: function(batch, part), parts))
+    half = len(batch.rows) // 2
+    halves = [jax.tree.map(lambda leaf, s=side: leaf[s], parts) for side in (slice(half), slice(half, None))]
+    first, second = (jax.lax.map(lambda part: function(batch, part), side) for side in halves)
+    return tuple(jnp.concatenate(leaves) for leaves in zip(first, second, strict=True))
 
 
 def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[[Batch, Part, Array], tuple[Array, ...]]) -> tuple[Array, ...]:
@@ -126,22 +135,26 @@ def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[[Batch, Par
     order = jnp.zeros(chunks * width, jnp.int32)
     order = order.at[jnp.where(missing, place - 1, chunks * width)].set(jnp.arange(chunks * width, dtype=jnp.int32), mode="drop")
 
-    def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
-        start, answers = at
+    def some(start: Array) -> tuple[Array, Array, list[Array]]:
         mine = jax.lax.dynamic_slice(order, (start,), (width,))
         # the last slice is moved back where it would reach beyond the end
         spare = jnp.minimum(start, chunks * width - width) + jnp.arange(width, dtype=jnp.int32) >= total
         chunk, lane = mine // width, mine % width
         part = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[chunk, ..., lane], 0, -1), Part(batch.agents, batch.rows, batch.kinds))
-        chunk = jnp.where(spare, chunks, chunk)
-        found = list(solver(batch, part, spare))
-        found[0] = jnp.moveaxis(found[0], 1, 0)  # the agents first, as they are when indexed
-        found[1] = jnp.moveaxis(found[1], 1, 0)
-        y, stiffness, *numbers = answers
-        y = y.at[chunk, :, lane].set(found[0], mode="drop")
-        stiffness = stiffness.at[chunk, :, lane].set(found[1], mode="drop")
-        put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
-        return start + width, (y, stiffness, *put)
+        y, stiffness, *numbers = solver(batch, part, spare)
+        # the agents first, as they are when indexed
+        return jnp.where(spare, chunks, chunk), lane, [jnp.moveaxis(y, 1, 0), jnp.moveaxis(stiffness, 1, 0), *numbers]
+
+    def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        start, answers = at
+        side_by_side = 2 if chunks >= MANY else 1
+        for chunk, lane, found in [some(start + k * width) for k in range(side_by_side)]:
+            y, stiffness, *numbers = answers
+            y = y.at[chunk, :, lane].set(found[0], mode="drop")
+            stiffness = stiffness.at[chunk, :, lane].set(found[1], mode="drop")
+            put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
+            answers = y, stiffness, *put
+        return start + side_by_side * width, answers
 
     return jax.lax.while_loop(lambda at: at[0] < total, more, (jnp.asarray(0, jnp.int32), first))[1]
 

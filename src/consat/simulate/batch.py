@@ -23,7 +23,7 @@ from consat.simulate.kernel import Now, World
 from consat.simulate.rounds import CHUNK, HOLD, NEVER, Ask, Chosen, Chunk, Rules, Tally, advance, start
 from consat.trace import Ending
 
-LANES = 256
+LANES = 32
 """The most lanes of a pool, …"""
 NUMBERS = 2**17
 """… of which all estimates together should be no more numbers than stay in a cache."""

@@ -13,6 +13,7 @@ from jax import Array
 
 from consat import prox
 from consat.estimates import Estimates
+from consat.family import distinct
 from consat.graphs import hops
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
@@ -53,10 +54,10 @@ class Ends:
         degree = np.bincount(receiver, minlength=copies.count)
         metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
         return cls(
-            jnp.asarray(receiver, dtype=jnp.int32),
-            jnp.asarray(other, dtype=jnp.int32),
+            jnp.asarray(receiver.astype(np.int32)),
+            jnp.asarray(other.astype(np.int32)),
             Groups.of(receiver, copies.count),
-            jnp.asarray(degree, dtype=float),
+            jnp.asarray(degree.astype(float)),
             jnp.asarray(metropolis),
         )
 
@@ -370,17 +371,21 @@ def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool
         convex=convex,
         precision=precision_for(team.count),
     )
-    talker, listener = copies.holder[copies.edges].astype(np.int64).T.reshape(2, -1)
-    pairs, pair = np.unique(talker * team.count + listener, return_inverse=True)
+    rough = weather.loss > 0 or weather.sleep > 0
+    talker, listener = copies.holder[copies.edges[:, 0]], copies.holder[copies.edges[:, 1]]
+    keys = talker.astype(np.int64) * team.count + listener
+    pairs = distinct(keys)
+    if not rough:  # then nobody asks who is at the ends
+        talker, keys = talker[:0], keys[:0]
     return World(
         everyone=everyone,
         observer=Objective.at_positions(team),
         own=jnp.asarray(copies.own),
-        talker=jnp.asarray(talker, dtype=jnp.int32),
-        pair=jnp.asarray(pair, dtype=jnp.int32),
+        talker=jnp.asarray(talker),
+        pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
         reach=jnp.asarray(np.inf if body is None else body.speed / body.rate),
         loss=jnp.asarray(weather.loss),
         sleep=jnp.asarray(weather.sleep),
         pairs=len(pairs),
-        rough=weather.loss > 0 or weather.sleep > 0,
+        rough=rough,
     )
