@@ -161,7 +161,7 @@ class Team:
                     names=Chosen(self.names, number),
                     sources=None if family.sources is None else Chosen(family.sources, inside),
                     turn=number,
-                )  # fmt: skip
+                )
             )
         team = copy.copy(self)
         team.__dict__.pop("constraints_per_agent", None)
