@@ -15,6 +15,7 @@ from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.prox import batches
+from consat.prox.lanes import LOOPED, UNROLLED, solve_symmetric
 
 EXACT = prox.Precision(1e-10)
 ONE_STEP = prox.Precision(None)
@@ -82,3 +83,18 @@ def test_many_chunks_are_one_chunk(by_pattern: Callable[[], None], monkeypatch: 
     parts = [steps(team, ONE_STEP, count, convex=True, v=v) for count in (1, 3)]
     for one, many in zip(whole, parts, strict=True):
         np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-12)  # the same iterations; programs of other shapes may fuse otherwise
+
+
+@float64
+@pytest.mark.parametrize("size", [1, 2, UNROLLED, UNROLLED + 1, LOOPED, LOOPED + 1])
+def test_small_systems_are_solved(size: int) -> None:
+    random = np.random.default_rng(size)
+    factor = random.normal(size=(5, size, size))
+    matrix = factor @ factor.transpose(0, 2, 1) + np.eye(size)
+    matrix[3] -= 2 * np.linalg.eigvalsh(matrix[3])[0] * np.eye(size) * (size > 1) + 3 * np.eye(size) * (size == 1) * matrix[3]
+    right = random.normal(size=(5, size, 2))
+    found, positive = solve_symmetric(jnp.asarray(np.moveaxis(matrix, 0, -1)), jnp.asarray(np.moveaxis(right, 0, -1)))
+    definite = np.linalg.eigvalsh(matrix)[:, 0] > 0
+    np.testing.assert_array_equal(positive, definite)
+    for k in np.flatnonzero(definite):  # condition numbers up to 1e3
+        np.testing.assert_allclose(np.asarray(found)[..., k], np.linalg.solve(matrix[k], right[k]), rtol=1e-9, atol=1e-10)
