@@ -1,7 +1,7 @@
 """Agents sorted into batches that are solved together, laid out with the agents last, so that arithmetic runs along them.
 
 Agents of the same *pattern* (as many constraints of each family, which read the same of their rows) make one batch: which row a
-constraint reads is then known beforehand, and curvature that does not vary is a constant. Small teams, and those with many patterns, are
+constraint reads is then known beforehand, and curvature that does not vary is a constant. Small teams, and agents of rare patterns, are
 padded to a common shape instead, which compiles once.
 """
 
@@ -22,9 +22,9 @@ from consat.numerics import once
 from consat.team import Team
 
 SMALL_TEAM = 2000
-"""Up to so many agents are batched by size and padded, which compiles once; more by pattern, which runs faster, …"""
-MOST_SHAPES = 4
-"""… while there are at most this many."""
+"""Up to so many agents are batched by size and padded, which compiles once; of more, those of the common patterns, which runs faster."""
+COMMON = 1 / 8
+"""A pattern that this part of a team has is common."""
 SQUARE = 2**15
 """Numbers in the matrices of a chunk, about: what stays in the cache while it is worked on."""
 WIDEST, NARROWEST = 2048, 64
@@ -118,8 +118,11 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
     made: list[_Made] = []
     if sizes is not None:
         bends = [_bend(family, team.dimension) for family in team.families]
-        patterns = _patterns(team, sizes) if team.count > SMALL_TEAM else None
-        for group in _padded(team, sizes) if patterns is None else patterns:
+        patterns = _patterns(team, sizes) if team.count > SMALL_TEAM else []
+        others = np.asarray(sizes.any(axis=1))
+        for group in patterns:
+            others[group.agents] = False
+        for group in [*patterns, *_padded(team, sizes, np.flatnonzero(others))]:
             made.append(_made(team, group, bends, row, count))
     rows, agents = np.full(count, -1, dtype=np.int32), np.full(team.count, -1, dtype=np.int32)
     row_start = agent_start = 0
@@ -151,21 +154,17 @@ class _Group(NamedTuple):
     slots: list[np.ndarray]
 
 
-def _patterns(team: Team, sizes: np.ndarray) -> list[_Group] | None:
-    """The agents by pattern; None if there are too many patterns."""
+def _patterns(team: Team, sizes: np.ndarray) -> list[_Group]:
+    """The agents of the common patterns."""
     some = np.flatnonzero(sizes.any(axis=1))
     base = np.concatenate([[1], np.cumprod(sizes.max(axis=0).astype(np.int64) + 1)[:-1]])
     code = sizes[some] @ base
-    codes = distinct(code)
-    if len(codes) > MOST_SHAPES:
-        return None
     groups = []
-    for one in codes:
+    for one in distinct(code):
         agents = some[code == one]
-        group = _pattern(team, agents, sizes[agents[0]])
-        if group is None:
-            return None
-        groups.append(group)
+        group = _pattern(team, agents, sizes[agents[0]]) if len(agents) >= COMMON * len(some) else None
+        if group is not None:
+            groups.append(group)
     return groups
 
 
@@ -209,12 +208,15 @@ def _members(team: Team, agents: np.ndarray, most: np.ndarray) -> list[np.ndarra
     return found
 
 
-def _padded(team: Team, sizes: np.ndarray) -> list[_Group]:
-    """The agents by the number of their rows, to the same power of two."""
+def _padded(team: Team, sizes: np.ndarray, own: np.ndarray) -> list[_Group]:
+    """These agents by the number of their rows, to the same power of two."""
+    if not len(own):
+        return []
     n = team.count
     keys = [family.owner[:, None].astype(np.int64) * n + family.agents for family in team.families]
-    own = np.flatnonzero(sizes.any(axis=1))
-    read = distinct(np.concatenate([own * (n + 1), *(key.ravel() for key in keys)]))
+    theirs = np.zeros(n, dtype=bool)
+    theirs[own] = True
+    read = distinct(np.concatenate([own * (n + 1), *(key[theirs[f.owner]].ravel() for key, f in zip(keys, team.families, strict=True))]))
     holder, position = np.divmod(read, n)
     first = np.searchsorted(holder, np.arange(n + 1))
     width = np.diff(first)

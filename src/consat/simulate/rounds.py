@@ -33,6 +33,8 @@ CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
 PATIENT = 1.5
 """Whether a team that stands still has no hope is asked again only when the run is so many times as long: the answer takes its time."""
+LARGE = 200_000
+"""Of more agents than these the rounds take longer than their program takes to compile well."""
 NEVER = 2**62
 """More rounds than there are."""
 SETTLED = 1e-5
@@ -216,8 +218,8 @@ def _look(world: World, chosen: Chosen, now: Now) -> Kept:
 
 
 @functools.cache
-def _compiled() -> tuple[Callable[..., tuple[Now, Chunk]], Callable[..., tuple[Now, Chunk]], Callable[..., Kept]]:
-    options = quick_compilation()
+def _compiled(large: bool) -> tuple[Callable[..., tuple[Now, Chunk]], Callable[..., tuple[Now, Chunk]], Callable[..., Kept]]:
+    options = None if large else quick_compilation()
     return (
         jax.jit(start, static_argnames=("protocol",), compiler_options=options),
         jax.jit(advance, static_argnames=("protocol", "capacity"), donate_argnames=("now",), compiler_options=options),
@@ -239,17 +241,18 @@ class OneProcess:
 
     def __init__(self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None) -> None:
         self._first, self._seed, self._hold = first, seed, hold
+        self._large = world.everyone.agents > LARGE
         self._protocol, self._world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
 
     def start(self) -> tuple[Now, Chunk]:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)
-        return _compiled()[0](self._protocol, self._world, self._chosen, first, key)
+        return _compiled(self._large)[0](self._protocol, self._world, self._chosen, first, key)
 
     def advance(self, state: Now, number: int, count: int, streak: int, every: int) -> tuple[Now, Chunk]:
         hold = NEVER if self._hold is None else self._hold
         ask = Ask(*(jnp.asarray(value) for value in (number, count, streak, every, hold)))
-        return _compiled()[1](self._protocol, self._world, self._chosen, self._capacity, state, ask)
+        return _compiled(self._large)[1](self._protocol, self._world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:
         return np.array(state.body)
@@ -258,7 +261,7 @@ class OneProcess:
         return stop
 
     def look(self, state: Now) -> Kept:
-        kept = _compiled()[2](self._world, self._chosen, state)
+        kept = _compiled(self._large)[2](self._world, self._chosen, state)
         return Kept(*map(np.array, kept))
 
 
