@@ -232,7 +232,9 @@ def measure(stage: Stage, name: str, conditions: Sequence[Condition], cap: int, 
         wanted = problem.convex and (problem.count <= SMALL or name == "max-min")
         if _over(satisfied if problem.feasible else np.zeros(1), optimal[:1] if wanted else np.zeros(1), done):
             break
-    floats = stage.copies_sent() * (problem.team.dimension + {"admm": 1, "max-min": 2}.get(name, 0))
+    floats = stage.copies_sent() * {"admm": 2 * problem.team.dimension + 1, "max-min": 2 * problem.team.dimension + 2}.get(
+        name, problem.team.dimension
+    )
     for k, condition in enumerate(conditions):
         stage.results[name, condition] = Measured(satisfied[k], optimal[k], satisfied[k] * floats, done, margins[k, -1])
     if name == "admm" and not problem.feasible and not stage.verdict:

@@ -150,10 +150,11 @@ def test_loss_and_sleep_are_survived_and_repeatable(case: str) -> None:
 @pytest.mark.parametrize(
     ("protocol", "layout", "floats"),
     [
-        # On each of the two links both ends hold one copy in common, x1 or x3: q (2 numbers) and ln ρ; and one number of the message's own.
-        ("admm", "local", 3 + 1),
+        # On each of the two links both ends hold one copy in common, x1 or x3: x and force (2 numbers each) and ln ρ; and one number of the
+        # message's own.
+        ("admm", "local", 5 + 1),
         # All three copies.
-        ("admm", "full", 9 + 1),
+        ("admm", "full", 15 + 1),
         # x alone.
         ("proximal", "local", 2 + 1),
     ],
@@ -265,8 +266,8 @@ def test_agents_without_constraints_or_links_and_alone() -> None:
     assert summary["status"] == "satisfied"
     assert summary["positions"]["idle"] == [7, 8]
     assert summary["agents"]["free"]["margin"] is None
-    # the link to another cluster carries nothing; a and free share x_free alone: q, ln ρ and the message's own number
-    assert (summary["messages"], summary["floats_sent"]) == (2 * summary["rounds"], 8 * summary["rounds"])
+    # the link to another cluster carries nothing; a and free share x_free alone: x, force, ln ρ and the message's own number
+    assert (summary["messages"], summary["floats_sent"]) == (2 * summary["rounds"], 12 * summary["rounds"])
 
 
 @pytest.mark.parametrize("dimension", [1, 3])

@@ -2,10 +2,11 @@
 keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
 
     x_i⁺ = argmin_y f_i(y) + Σ_j ρ_ij/2 ‖y − u_ij‖²
-    send   q_ij = 2 x_i⁺ − u_ij
-    on receipt of q_ji:   u_ij ← (1 − a) u_ij + a q_ji             a lost message leaves u_ij as it was
+    send   x_i⁺ and the force  g_ij = ρ_ij (u_ij − x_i⁺)
+    on receipt from j:   u_ij ← (1 − a) u_ij + a (x_j − g_ji/ρ_ij)             a lost message leaves u_ij as it was
 
-It converges under random loss and wake-ups from any u: there is no invariant to lose. The penalty of a link is the geometric mean of what
+x_j − g_ji/ρ_ij is q_ji/ρ_ij of the paper where both ends hold the same penalty, and keeps the balance of forces while they don't, because
+a message that told of a change was lost: then points alone would drift apart. It converges under random loss and wake-ups from any u: there is no invariant to lose. The penalty of a link is the geometric mean of what
 its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest; then each end lets ρ_i rise
 slowly towards the stiffness of its own f_i, and fall towards it only once it knows that all are satisfied: by then the optimum is all that
 is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
@@ -57,6 +58,7 @@ class Admm:
         cautious: … which only convex teams are: where some ψ are not concave a is at most this. With more they fell into cycles.
         penalty: ρ at the start, in 1/length².
         share: of the stiffness, that ρ_i moves towards.
+        least: of the penalty at the start, below which ρ_i does not fall: agents with room to spare have no stiffness to speak of.
         rise: how much ln ρ_i may rise in a round.
         fall: how much it may fall while a message crosses the team, once the agent knows that all are satisfied.
         horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
@@ -66,7 +68,8 @@ class Admm:
     cautious: float = 0.5
     penalty: float = 10.0
     share: float = 0.3
-    rise: float = 0.02
+    least: float = 1e-3
+    rise: float = 0.005
     fall: float = 0.2
     horizon: float = 50.0
     name = "admm"
@@ -84,7 +87,7 @@ class Admm:
 
     def speak(
         self, state: AdmmState, solver: Solver, round_: Array, known: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[AdmmState, tuple[Array, Array]]:
+    ) -> tuple[AdmmState, tuple[Array, Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
         penalty = 0.5 * (links.at(wish) + state.heard)
@@ -95,15 +98,17 @@ class Admm:
         x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory, sharper, above)
         neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
         stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
-        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.log(stiff + jnp.finfo(x.dtype).tiny))
+        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.log(jnp.maximum(stiff, self.least * self.penalty / solver.length**2)))
         since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
         rise = self.rise / (1.0 + (round_ / horizon) ** 4)
         fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
         wish = wish + jnp.clip(goal - wish, -fall, rise)
-        return AdmmState(x, u, wish, state.heard, penalty, memory), (2 * links.at(x) - u, links.at(wish))
+        here = links.at(x)
+        return AdmmState(x, u, wish, state.heard, penalty, memory), (here, rho[:, None] * (u - here), links.at(wish))
 
-    def hear(self, state: AdmmState, message: tuple[Array, Array], arrived: Array, solver: Solver) -> AdmmState:
-        q, wish = message
+    def hear(self, state: AdmmState, message: tuple[Array, Array, Array], arrived: Array, solver: Solver) -> AdmmState:
+        there, force, wish = message
+        q = there - force / jnp.exp(state.penalty)[:, None]
         a = self.relaxation if solver.convex else min(self.relaxation, self.cautious)
         u = jnp.where(arrived[:, None], (1 - a) * state.u + a * q, state.u)
         return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))

@@ -8,7 +8,7 @@ that; a stage lasts long enough for the smallest to reach everyone. β̄* − β
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -42,13 +42,15 @@ class MaxMin:
         stage: rounds at each ν, and …
         crossings: … as many more as a message needs to cross the team so many times.
         stages: how often ν doubles.
+        rise: how much ln ρ_i may rise in a stage.
         admm: how each stage is solved.
     """
 
     stage: int = 12
     crossings: int = 4
     stages: int = 10
-    admm: Admm = field(default=Admm(rise=0.1, fall=0.8))
+    rise: float = 2.0
+    admm: Admm = field(default=Admm(fall=0.8))
     name = "max-min"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "admm": Admm.per, "heard": "agent", "level": "agent"}
 
@@ -64,7 +66,7 @@ class MaxMin:
 
     def speak(
         self, state: MaxMinState, solver: Solver, round_: Array, known: Array
-    ) -> tuple[MaxMinState, tuple[tuple[Array, Array], Array]]:
+    ) -> tuple[MaxMinState, tuple[tuple[Array, Array, Array], Array]]:
         stage = self._rounds(solver)
         number, within = jnp.floor(round_ / stage), round_ % stage
         turn = (number > 0) & (number <= self.stages) & (within == 0)
@@ -72,13 +74,14 @@ class MaxMin:
         sharper, above = 2.0 ** jnp.minimum(number, self.stages), jnp.where(number > 0, level, 0.0)
         # penalties may fall throughout, and settle once the last stage is over
         free = 1.0 + jnp.maximum(round_ - self.earliest(solver), 0.0) + jnp.zeros_like(known)
-        admm, message = self.admm.speak(state.admm, solver, within, free, sharper, above)
+        paced = replace(self.admm, rise=self.rise / stage)
+        admm, message = paced.speak(state.admm, solver, within, free, sharper, above)
         margin = solver.margin(admm.x)
         # what was heard in the first half of a stage is of positions still on their way
         heard = jnp.where(within <= stage // 2, margin, jnp.minimum(state.heard, margin))
         return MaxMinState(admm.x, admm, heard, level), (message, solver.links.at(solver.to_rows(heard)))
 
-    def hear(self, state: MaxMinState, message: tuple[tuple[Array, Array], Array], arrived: Array, solver: Solver) -> MaxMinState:
+    def hear(self, state: MaxMinState, message: tuple[tuple[Array, Array, Array], Array], arrived: Array, solver: Solver) -> MaxMinState:
         points, margins = message
         least = solver.least(jnp.where(arrived, margins, jnp.inf))
         return state._replace(admm=self.admm.hear(state.admm, points, arrived, solver), heard=jnp.minimum(state.heard, least))
