@@ -138,7 +138,8 @@ def test_record_is_thinned_and_sampled(tmp_path: Path) -> None:
     assert list(thin.data["agent"].values) == ["a1", "a3"]
     chosen = whole.sel(agent=["a1", "a3"], round=thin.data["round"].values)
     for name in ("position", "margin", "agent_margin", "smooth_margin"):
-        np.testing.assert_array_equal(thin.data[name].values, chosen[name].values)
+        # two programs, which may round the last bit differently
+        np.testing.assert_allclose(thin.data[name].values, chosen[name].values, rtol=1e-13, atol=1e-15)
     # what is told of the run does not depend on what is recorded of it
     assert thin.summary["satisfied_from"] == cs.run("case-c", rounds=50).summary["satisfied_from"]
     np.testing.assert_array_equal(thin.data["final_position"].values, whole["position"].values[-1])

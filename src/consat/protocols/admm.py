@@ -6,12 +6,12 @@ keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
     on receipt from j:   u_ij ← (1 − a) u_ij + a (x_j − g_ji/ρ_ij)             a lost message leaves u_ij as it was
 
 x_j − g_ji/ρ_ij is q_ji/ρ_ij of the paper where both ends hold the same penalty, and keeps the balance of forces while they don't, because
-a message that told of a change was lost: then points alone would drift apart. It converges under random loss and wake-ups from any u: there is no invariant to lose. The penalty of a link is the geometric mean of what
-its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It begins stiff, where constraints are met soonest; then each end lets ρ_i rise
-slowly towards the stiffness of its own f_i, and fall towards it only once it knows that all are satisfied: by then the optimum is all that
-is left to find, and a soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij
-changes, u_ij − x_i is rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the
-negative curvature of f_i the step would have no minimum.
+a message that told of a change was lost: points alone would drift apart. It converges under random loss and wake-ups from any u: there is
+no invariant to lose. The penalty of a link is the geometric mean of what its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It
+begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, and fall so
+only once it knows that all are satisfied: by then the optimum is all that is left to find, and a soft penalty finds it soonest. A copy that
+no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force
+ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i the step would have no minimum.
 
 The points begin where the team's places are, however far out the bodies start: any would do, and near ones are rounds away.
 """
@@ -68,7 +68,7 @@ class Admm:
     cautious: float = 0.5
     penalty: float = 10.0
     share: float = 0.3
-    least: float = 1e-3
+    least: float = 1e-6
     rise: float = 0.005
     fall: float = 0.2
     horizon: float = 50.0
