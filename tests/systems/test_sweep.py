@@ -111,11 +111,12 @@ def test_command_writes_table_csv_json_and_figure(tmp_path: Path) -> None:
     done = subprocess.run([*command, "--seed", "2", "--out", tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "rounds to satisfaction" in done.stdout
-    rows = list(csv.DictReader((tmp_path / "sweep.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "sweep.csv").read_text().splitlines()))
     assert (len(rows), rows[0]["seed"], rows[0]["status"]) == (30, "2", "satisfied")
     summary = json.loads((tmp_path / "sweep.json").read_text())
     assert (summary["schema"], summary["count"], len(summary["groups"])) == ("consat.sweep/1", 30, 6)
-    assert Image.open(tmp_path / "sweep.png").size[0] > 800
+    with Image.open(tmp_path / "sweep.png") as picture:
+        assert picture.size[0] > 800
     wrong = subprocess.run([CONSAT, "sweep", "case-c", "--over", "loss"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
     assert "PATH=VALUES" in wrong.stderr

@@ -87,7 +87,7 @@ class ManyProcesses:
         self._share = share = Share.of(team, copies, part, self._me, self._count)
         self._protocol, self._hold, self._choice, self._seed = protocol, hold, choice, weather.seed
         self._first, self._agents, self._dimension = first[share.rows], team.count, team.dimension
-        world = world_of(share.team, share.copies, nu, size, convex=convex, weather=weather, body=body)
+        world = world_of(share.team, share.copies, nu, size, convex=convex, weather=weather, body=body, partial=True)
         links = dataclasses.replace(world.everyone.links, metropolis=jnp.asarray(1.0 / (1.0 + share.degree)))
         everyone = dataclasses.replace(
             world.everyone, links=links, hops=hops(team.count, copies.links), precision=precision_for(team.count)

@@ -354,8 +354,11 @@ def precision_for(count: int) -> prox.Precision:
     return EXACT if count <= prox.SMALL_TEAM else QUICK
 
 
-def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None) -> World:
-    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`."""
+def world_of(
+    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, partial: bool = False
+) -> World:
+    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; partial: whether it is of one process among
+    several, which must know whose messages to count."""
     ends = Ends.of(copies)
     everyone = Everyone(
         links=ends,
@@ -375,7 +378,7 @@ def world_of(team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool
     talker, listener = copies.holder[copies.edges[:, 0]], copies.holder[copies.edges[:, 1]]
     keys = talker.astype(np.int64) * team.count + listener
     pairs = distinct(keys)
-    if not rough:  # then nobody asks who is at the ends
+    if not (rough or partial):  # then nobody asks who is at the ends
         talker, keys = talker[:0], keys[:0]
     return World(
         everyone=everyone,
