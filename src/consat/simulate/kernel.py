@@ -357,8 +357,8 @@ def precision_for(count: int) -> prox.Precision:
 def world_of(
     team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, partial: bool = False
 ) -> World:
-    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; partial: whether it is of one process among
-    several, which must know whose messages to count."""
+    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; partial: whether it is of one process
+    among several, which must know whose messages to count."""
     ends = Ends.of(copies)
     everyone = Everyone(
         links=ends,
