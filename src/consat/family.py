@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, overload
@@ -133,9 +134,9 @@ def distinct(keys: np.ndarray) -> np.ndarray:
 class Texts(Sequence[str]):
     """Texts that are made when asked for; compares equal to any sequence of the same ones."""
 
+    @abstractmethod
     def text(self, index: int) -> str:
         """The text at `index`, which is in range."""
-        raise NotImplementedError
 
     @overload
     def __getitem__(self, index: int) -> str: ...

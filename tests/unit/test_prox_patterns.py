@@ -73,7 +73,7 @@ def test_one_step_at_a_time_ends_at_the_solution(by_pattern: Callable[[], None])
 
 
 def test_many_chunks_are_one_chunk(by_pattern: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks, halves and the gathering of those who are not done change no bit."""
+    """Chunks, halves and the gathering of those who are not done change nothing beyond rounding."""
     by_pattern()
     team = cs.load("convoy", ["count=700"]).team
     v = starts(team, 20.0)
