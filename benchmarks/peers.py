@@ -115,11 +115,7 @@ def _gradient(everyone: Everyone, lane: Lanes, round_: Array) -> Callable[[Array
     ramp = lane.beta * jnp.minimum(1.0, RAMP[0] + RAMP[1] * lane.step * round_)
     nu = Nu(lane.alpha, jnp.where(lane.ramped > 0, ramp, lane.beta))
 
-    def gradient(x: Array) -> Array:
-        log_f, ascent = everyone.local.ascent(x, nu)
-        return -nu.beta * jnp.exp(log_f)[everyone.holder][:, None] * ascent
-
-    return gradient
+    return lambda x: everyone.local.gradient(x, nu)
 
 
 @functools.partial(jax.jit, static_argnames=("method",), compiler_options=quick_compilation())

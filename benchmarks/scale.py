@@ -1,60 +1,99 @@
 """Seconds a round and bytes an agent for teams of a thousand to a million, beside the time of copying their state once.
 
-    python benchmarks/scale.py [--most 1000000] [--out docs/figures/scale.png]
+    python benchmarks/scale.py [--most 1000000] [--teams convoy lattice swarm] [--out docs/benchmarks]
 
-Prints a table, and draws it. Every team runs until it is satisfied; then its rounds are warm, and are timed, each beside an out-of-place
-`numpy.copyto` of as many bytes as the state has. The exponent is the slope of the line through the times of all sizes. Below, the
-agent-updates a second of the paper's gradient flow (chain, full estimates, fixed steps), beside the same in plain NumPy.
+Writes ``scale.md`` and ``scale.png``. Each team has a process to itself, so that its peak of memory is its own, and runs until it is
+satisfied; its rounds are warm then, and are timed in blocks, each beside an out-of-place `numpy.copyto` of as many bytes as the state has.
+So are steps of the paper's gradient flow over the same estimates, beside a copy of theirs. An exponent is the slope of the line through the
+times of the sizes from `LINEAR` on, in logarithms. Then `consat run` from the shell, everything included. Last, agent-updates a second of
+small teams (chains, every agent estimating all, as in the paper): the gradient flow by fixed steps, beside the same in plain NumPy.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
+import json
+import multiprocessing
+import os
+import platform
 import resource
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import consat as cs
-from consat.estimates import Estimates
+from consat.estimates import Estimates, Exchange
 from consat.numerics import float64
-from consat.objective import Objective, Schedule
-from consat.protocols import ROUNDS
+from consat.objective import Nu, Objective, Schedule
+from consat.protocols import FLOWS, ROUNDS, State
 from consat.quadratics import shape_of
 from consat.runner import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
+from consat.simulate.flows import Problem, rate
 
-MOST_ROUNDS = 100
-TIMED = 7
-"""Warm rounds timed; the median counts, and the machine may be busy with other things meanwhile."""
+TEAMS = ("convoy", "lattice", "swarm")
+COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+LINEAR = 3_000
+"""Agents from which on the exponent is fitted: smaller teams solve every local step exactly."""
+MOST_ROUNDS = 150
+BLOCK = 4
+"""Rounds, or steps of the flow, that are timed together: a run has them in one program too."""
+BLOCKS = 7
+"""Blocks timed; the median counts, as the machine may be busy with other things meanwhile."""
 STEP = 0.01
 """Of the gradient flow, s."""
+COLORS = {"convoy": "#0072B2", "lattice": "#D55E00", "swarm": "#009E73"}
+MARKERS = {"convoy": "o", "lattice": "s", "swarm": "^"}
+SMALL = (3, 10, 50, 200)
 
 
 class Row(NamedTuple):
-    """Of one team."""
+    """Of one team: seconds to build and to compile, the first round from which it is satisfied, seconds a warm round, a copy of its state and
+    of a flow's, a step of the flow; bytes of state and of the process at its peak."""
 
-    name: str
+    team: str
     agents: int
     build: float
     compile: float
     satisfied: int | None
     round: float
     copy: float
+    step: float
+    step_copy: float
     state: int
     peak: int
 
+    @property
+    def ratio(self) -> float:
+        return self.round / self.copy
 
-def timed(function: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    jax.block_until_ready(function())
-    return time.perf_counter() - begin
+    @property
+    def step_ratio(self) -> float:
+        return self.step / self.step_copy
+
+
+def beside_a_copy(advance: Callable[[Any], Any], state: Any) -> tuple[float, float, int, Any]:
+    """Seconds a step of `advance`, which takes `BLOCK` of them, seconds of copying what it carries, and how many bytes these are."""
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    source, target, taken, copied = np.ones(size // 8), np.zeros(size // 8), [], []
+    for _ in range(BLOCKS):
+        begin = time.perf_counter()
+        state = jax.block_until_ready(advance(state))
+        taken.append((time.perf_counter() - begin) / BLOCK)
+        begin = time.perf_counter()
+        np.copyto(target, source)
+        copied.append(time.perf_counter() - begin)
+    return float(np.median(taken)), float(np.median(copied)), size, state
 
 
 @float64
@@ -64,51 +103,59 @@ def measure(name: str, count: int) -> Row:
     team, size = scenario.team, scale(scenario.team)
     copies, nu = Estimates.of(team, "local"), Schedule.of(automatic(size)).final
     convex = bool(shape_of(team).concave.all())
-    world = kernel.world_of(team, copies, nu, size.length, convex=convex, weather=kernel.Weather(), body=None)
+    world = kernel.world_of(team, copies, nu, size, convex=convex, weather=kernel.Weather(), body=None)
     first = jnp.asarray(first_estimates(team, copies, scenario.settings.start, size))
     build, begin = time.perf_counter() - begin, time.perf_counter()
     protocol = ROUNDS["admm"]()
-    now, seen = jax.jit(kernel.begin, static_argnames=("protocol",))(protocol, world, first, jax.random.key(0))
-    step = jax.jit(kernel.one_round, static_argnames=("protocol",), donate_argnames=("now",))
-    one = step.lower(protocol, world, now, jnp.asarray(0.0)).compile()
+
+    def rounds(world: kernel.World, now: kernel.Now, number: jax.Array) -> tuple[kernel.Now, jax.Array]:
+        return kernel.many_rounds(protocol, world, now, number + jnp.arange(BLOCK, dtype=float), lambda seen: seen.margin)
+
+    now, _ = jax.jit(kernel.begin, static_argnames=("protocol",))(protocol, world, first, jax.random.key(0))
+    several = jax.jit(rounds, donate_argnums=1).lower(world, now, jnp.asarray(0.0)).compile()
     compiled = time.perf_counter() - begin
-    satisfied, number = None, 0
-    while number < MOST_ROUNDS and satisfied is None:
-        now, seen = one(world, now, jnp.asarray(float(number)))
-        number += 1
-        satisfied = number if float(seen.margin) > 0 else None
-    for _ in range(3):
-        now, seen = one(world, now, jnp.asarray(float(number)))
-        number += 1
-    state = sum(leaf.nbytes for leaf in jax.tree.leaves((now.state, now.ages, now.body)))
-    source, target, rounds, copying = np.ones(state // 8), np.zeros(state // 8), [], []
-    for _ in range(TIMED):
-        begin = time.perf_counter()
-        now, seen = jax.block_until_ready(one(world, now, jnp.asarray(float(number))))
-        rounds.append(time.perf_counter() - begin)
-        copying.append(timed(lambda: np.copyto(target, source)))
-        number += 1
+    margins: list[float] = []
+    while len(margins) < MOST_ROUNDS and not (margins and min(margins[-BLOCK:]) > 0):
+        now, margin = several(world, now, jnp.asarray(float(len(margins))))
+        margins += np.asarray(margin).tolist()
+    last_bad = max((k for k, margin in enumerate(margins) if margin <= 0), default=-1)
+    satisfied = last_bad + 2 if margins[-1] > 0 else None  # round k is the k-th after the start
+    later = jnp.asarray(float(len(margins)))
+    round_, copy, state, now = beside_a_copy(lambda at: several(world, at, later)[0], now)
+    step, step_copy = flow_steps(team, copies, nu, now.state.x)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return Row(name, count, build, compiled, satisfied, float(np.median(rounds)), float(np.median(copying)), state, peak)
+    return Row(name, count, build, compiled, satisfied, round_, copy, step, step_copy, state, peak)
+
+
+def flow_steps(team: cs.Team, copies: Estimates, nu: Nu, x: jax.Array) -> tuple[float, float]:
+    """Seconds an explicit step of the gradient flow over local estimates, from x, and seconds of copying its state."""
+    flow, problem = FLOWS["gradient-flow"](), Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=float(nu.alpha), nu_beta=1.0)))
+
+    def once(_: int, at: State) -> State:
+        slope = rate(flow, problem, jnp.asarray(0.0), at)
+        return State(at.x + STEP * slope.x, at.z + STEP * slope.z)
+
+    start = flow.start(x + 0.0)
+    several = jax.jit(lambda at: jax.lax.fori_loop(0, BLOCK, once, at), donate_argnums=0).lower(start).compile()
+    step, copy, _, _ = beside_a_copy(several, start)
+    return step, copy
 
 
 @float64
-def flow(count: int, seconds: float = 1.0) -> tuple[float, float]:
+def small(count: int, seconds: float = 1.0) -> tuple[float, float]:
     """Agent-updates a second of the gradient flow, ẋ = −∇f − (Lx) − z, ż = Lx, every agent estimating all: consat's and NumPy's."""
     team = cs.load("convoy", [f"count={count}"]).team
     copies = Estimates.of(team, "full")
     objective = Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count)
-    exchange, nu = copies.exchange(), Schedule.of(cs.Smoothing(nu_alpha=1.0, nu_beta=1.0)).final
+    exchange, nu = copies.exchange(), Nu(1.0, 1.0)
     steps = 200
 
     @jax.jit
-    def many(objective: Objective, exchange: object, x: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def many(objective: Objective, exchange: Exchange, x: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         def once(_: int, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             x, z = at
-            level, ascent = objective.ascent(x, nu)
-            away = exchange.disagreement(x)  # type: ignore[attr-defined]
-            force = nu.beta * jnp.exp(level)[copies.holder][:, None] * ascent
-            return x + STEP * (force - away - z), z + STEP * away
+            away = exchange.disagreement(x)
+            return x - STEP * (objective.gradient(x, nu) + away + z), z + STEP * away
 
         return jax.lax.fori_loop(0, steps, once, (x, z))
 
@@ -118,8 +165,7 @@ def flow(count: int, seconds: float = 1.0) -> tuple[float, float]:
     while time.perf_counter() - begin < seconds:
         x, z = jax.block_until_ready(many(objective, exchange, x, z))
         done += steps
-    ours = done * count / (time.perf_counter() - begin)
-    return ours, _plain(count, seconds)
+    return done * count / (time.perf_counter() - begin), _plain(count, seconds)
 
 
 def _plain(count: int, seconds: float) -> float:
@@ -144,55 +190,103 @@ def _plain(count: int, seconds: float) -> float:
     return done * count / (time.perf_counter() - begin)
 
 
-def exponent(rows: list[Row]) -> float:
-    return float(np.polyfit(np.log([row.agents for row in rows]), np.log([row.round for row in rows]), 1)[0])
+def from_the_shell(name: str, count: int) -> tuple[float, float, dict[str, Any]]:
+    """Seconds and the peak of memory, bytes, of `consat run`, and what it says."""
+    command = [sys.executable, "-m", "consat", "run", name, "--set", f"count={count}", "--json"]
+    begin = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    said = json.loads(process.stdout.read())
+    _, _, used = os.wait4(process.pid, 0)
+    return time.perf_counter() - begin, used.ru_maxrss * 1024, said
 
 
-def draw(rows: list[Row], path: Path) -> None:
+def alone(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function gives in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def exponent(rows: Sequence[Row]) -> float:
+    large = [row for row in rows if row.agents >= LINEAR]
+    return (
+        float(np.polyfit(np.log([row.agents for row in large]), np.log([row.round for row in large]), 1)[0]) if len(large) > 1 else np.nan
+    )
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for name in dict.fromkeys(row.name for row in rows):
-        mine = [row for row in rows if row.name == name]
-        agents = [row.agents for row in mine]
-        left.loglog(agents, [row.round for row in mine], "o-", label=f"{name}, exponent {exponent(mine):.2f}")
-        left.loglog(agents, [row.copy for row in mine], ":", color=left.lines[-1].get_color())
-        right.loglog(agents, [row.state / row.agents for row in mine], "o-", label=name)
-    left.set(xlabel="agents", ylabel="seconds a round", title="A warm round (dotted: copying the state once)")
-    right.set(xlabel="agents", ylabel="bytes of state an agent", title="State", ylim=(50, 2000))
-    left.legend()
-    right.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    for name in dict.fromkeys(row.team for row in rows):
+        mine = [row for row in rows if row.team == name]
+        agents, style = [row.agents for row in mine], {"color": COLORS[name], "marker": MARKERS[name]}
+        left.loglog(agents, [1e3 * row.round for row in mine], label=f"{name}: slope {exponent(mine):.2f}", **style)
+        left.loglog(agents, [1e3 * row.copy for row in mine], ":", color=COLORS[name])
+        right.loglog(agents, [row.state / row.agents for row in mine], label=f"{name}: state", **style)
+        right.loglog(agents, [row.peak / row.agents for row in mine], ":", color=COLORS[name], label=f"{name}: peak of the process")
+    left.set(xlabel="agents", ylabel="ms", title="A warm round of admm (dotted: copying the state once)")
+    right.set(xlabel="agents", ylabel="bytes an agent", title="Memory")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=9)
     figure.savefig(path, dpi=120)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--most", type=int, default=1_000_000)
-    parser.add_argument("--out", type=Path, default=Path("docs/figures/scale.png"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--most", type=int, default=COUNTS[-1])
+    parser.add_argument("--teams", nargs="+", choices=TEAMS, default=TEAMS)
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
     asked = parser.parse_args()
-    counts = [count for count in (3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if count <= asked.most]
-    print(
-        "| team | agents | build, s | compile, s | satisfied from round | ms a round | × copying the state | bytes an agent | peak, GiB |"
+    counts = [count for count in COUNTS if count <= asked.most]
+    lines: list[str] = []
+
+    def say(line: str = "") -> None:
+        lines.append(line)
+        print(line, flush=True)
+
+    say("# A thousand to a million agents\n")
+    say(
+        f"`python benchmarks/scale.py` on {datetime.date.today()}: {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"JAX {jax.__version__}, NumPy {np.__version__}, consat {cs.__version__}, float64. Medians of {BLOCKS}.\n"
     )
-    print("|---|---|---|---|---|---|---|---|---|")
-    rows = []
-    for name in ("convoy", "lattice", "swarm"):
+    say("![milliseconds a round and bytes an agent, against the number of agents](scale.png)\n")
+    say("Protocol `admm` over local estimates. Satisfied: the first round after the last with a margin ≤ 0.\n")
+    say(
+        "| team | agents | build, s | compile, s | satisfied from round | ms a warm round | × copying its state | ms a step of the flow "
+        "| × copying its state | bytes of state an agent | peak, GiB |"
+    )
+    say("|---|---|---|---|---|---|---|---|---|---|---|")
+    rows: list[Row] = []
+    for name in asked.teams:
         for count in counts:
-            row = measure(name, count)
+            row = alone(measure, name, count)
             rows.append(row)
-            print(
-                f"| {name} | {count:,} | {row.build:.2f} | {row.compile:.1f} | {row.satisfied} | {1e3 * row.round:.2f} "
-                f"| {row.round / row.copy:.1f} | {row.state / count:.0f} | {row.peak / 2**30:.2f} |",
-                flush=True,
+            say(
+                f"| {name} | {count:,} | {row.build:.2f} | {row.compile:.1f} | {row.satisfied or '–'} | {1e3 * row.round:.2f} "
+                f"| {row.ratio:.1f} | {1e3 * row.step:.2f} | {row.step_ratio:.1f} | {row.state / count:.0f} | {row.peak / 2**30:.2f} |"
             )
-    for name in ("convoy", "lattice", "swarm"):
-        print(f"exponent of {name}: {exponent([row for row in rows if row.name == name]):.3f}")
-    print("\n| agents | gradient flow, agent-updates a second | plain NumPy |\n|---|---|---|")
-    for count in (3, 10, 50, 200):
-        ours, plain = flow(count)
-        print(f"| {count} | {ours:,.0f} | {plain:,.0f} |", flush=True)
-    draw(rows, asked.out)
+    say()
+    for name in asked.teams:
+        say(f"* {name}: a round takes time ∝ N^{exponent([row for row in rows if row.team == name]):.2f} from N = {LINEAR:,} on.")
+    asked.out.mkdir(parents=True, exist_ok=True)
+    draw(rows, asked.out / "scale.png")
+    say("\n## From the shell\n\nThe second run of `consat run TEAM --set count=N --json`, importing, compiling and certifying included.\n")
+    say("| team | agents | s | peak, GiB | status | satisfied from round | rounds |\n|---|---|---|---|---|---|---|")
+    for name in asked.teams:
+        from_the_shell(name, counts[-1])
+        seconds, peak, said = from_the_shell(name, counts[-1])
+        say(
+            f"| {name} | {counts[-1]:,} | {seconds:.1f} | {peak / 2**30:.2f} | {said['status']} | {said['satisfied_from']['round']} "
+            f"| {said['rounds']} |"
+        )
+    say("\n## Small teams\n\nGradient flow by fixed steps, chain, every agent estimating all: agent-updates a second.\n")
+    say("| agents | consat | plain NumPy |\n|---|---|---|")
+    for count in SMALL:
+        ours, plain = alone(small, count)
+        say(f"| {count} | {ours:,.0f} | {plain:,.0f} |")
+    (asked.out / "scale.md").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from consat.errors import InvalidSettings
+from consat.family import distinct
 from consat.graphs import cluster_links, clusters, holders, require_connected
 from consat.numerics import Groups
 from consat.team import Team
@@ -135,6 +136,6 @@ def _both_ways(links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _used(talkers: np.ndarray, count: int) -> np.ndarray:
     """(L, 2) the links, i < j, each once, between the agents at both ends of (E, 2) edges."""
-    keys = np.unique(talkers[:, 0].astype(np.int64) * count + talkers[:, 1])
+    keys = distinct(talkers[:, 0].astype(np.int64) * count + talkers[:, 1])
     links = np.stack([keys // count, keys % count], axis=1).astype(np.int32)
     return links[links[:, 0] < links[:, 1]]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import operator
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ParamSpec, Self, TypeVar
+from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PADDING_LIMIT = 4
-"""Groups are padded to the largest while that costs at most this many times the elements; beyond, they are scattered."""
+"""Groups are padded to the largest while that costs at most this many times the elements; beyond, and where most groups are empty, they
+are scattered."""
+UNROLLED = 16
+"""Groups of up to so many are folded element by element, which needs no room for all."""
 
 
 def float64(function: Callable[P, T]) -> Callable[P, T]:
@@ -60,7 +64,7 @@ class Groups:
 
     Attributes:
         group: (E,) the group of each element.
-        index: (G, width) the elements of each group, padded with E; or (E,) elements in the order of their groups; or None when
+        index: (width, G) the elements of each group, padded with E; or (E,) elements in the order of their groups; or None when
             the elements lie in order and all groups have the same size.
         count: G.
         width: size of the largest group.
@@ -84,11 +88,11 @@ class Groups:
         if rising and count * width == len(group):
             return cls(device, None, count, width, padded=True)
         order = (np.arange(len(group)) if rising else np.argsort(group, kind="stable")).astype(np.int32)
-        if count * width > PADDING_LIMIT * max(len(group), count):
+        if count * width > PADDING_LIMIT * max(len(group), count) or len(group) * PADDING_LIMIT < count:
             return cls(device, jnp.asarray(order), count, width, padded=False)
-        index = np.full((count, width), len(group), dtype=np.int32)
+        index = np.full((width, count), len(group), dtype=np.int32)
         ranked = group if rising else group[order]
-        index[ranked, np.arange(len(group)) - (np.cumsum(sizes) - sizes)[ranked]] = order
+        index[np.arange(len(group)) - (np.cumsum(sizes) - sizes)[ranked], ranked] = order
         return cls(device, jnp.asarray(index), count, width, padded=True)
 
     def spread(self, values: Array) -> Array:
@@ -97,39 +101,57 @@ class Groups:
             return values if self.width == 1 else jnp.repeat(values, self.width, axis=0, total_repeat_length=self.count * self.width)
         return values[self.group]
 
-    def gather(self, elements: Array, empty: float) -> Array:
-        """(E, …) → (G, width, …), short groups filled with `empty`. Only for the padded form."""
-        if self.index is None:
-            return elements.reshape(self.count, self.width, *elements.shape[1:])
-        filler = jnp.full((1, *elements.shape[1:]), empty, elements.dtype)
-        return jnp.concatenate([elements, filler])[self.index]
+    def _taken(self, elements: Array, index: Array, empty: float) -> Array:
+        """The elements at an index that is padded with their number."""
+        last = len(elements) - 1
+        there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
+        return jnp.where(there, elements[jnp.minimum(index, last)], empty)  # a copy with a filler behind it would cost as much again
 
     def sum(self, elements: Array) -> Array:
         """(E, …) → (G, …): the sum over each group, 0 for an empty one."""
-        if not self.padded:
-            assert self.index is not None
-            return jax.ops.segment_sum(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
-        if self.index is None and self.width == 1:
-            return elements
-        return jnp.sum(self.gather(elements, 0.0), axis=1)
+        return self._folded(elements, _SUM)
 
     def max(self, elements: Array) -> Array:
         """(E, …) → (G, …): the maximum over each group, −∞ for an empty one."""
+        return self._folded(elements, _MAX)
+
+    def _folded(self, elements: Array, fold: _Fold) -> Array:
         if not self.padded:
             assert self.index is not None
-            return jax.ops.segment_max(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
-        if self.index is None and self.width == 1:
-            return elements
-        return jnp.max(self.gather(elements, -jnp.inf), axis=1, initial=-jnp.inf)
+            return fold.sorted(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
+        if self.width == 0 or self.count == 0:
+            return jnp.full((self.count, *elements.shape[1:]), fold.empty, elements.dtype)
+        if self.index is None:
+            parts = jnp.moveaxis(elements.reshape(self.count, self.width, *elements.shape[1:]), 1, 0)
+        elif self.width > UNROLLED:
+            parts = self._taken(elements, self.index, fold.empty)
+        else:
+            return functools.reduce(fold.two, [self._taken(elements, index, fold.empty) for index in self.index])
+        return functools.reduce(fold.two, list(parts)) if self.width <= UNROLLED else fold.axis(parts, axis=0)
 
     def logsumexp(self, elements: Array) -> tuple[Array, Array]:
         """(E,) → (G,) and (E,): log Σ exp over each group, −∞ for an empty one, and the softmax weights within the group."""
+        if self.width <= 1 and self.padded:
+            return self.max(elements), jnp.ones_like(elements)
         top = jax.lax.stop_gradient(self.max(elements))
         shift = jnp.where(jnp.isfinite(top), top, 0.0)
         powers = jnp.exp(elements - self.spread(shift))
         total = self.sum(powers)
         weights = powers / self.spread(jnp.where(total > 0.0, total, 1.0))
         return jnp.where(total > 0.0, jnp.log(jnp.where(total > 0.0, total, 1.0)) + shift, -jnp.inf), weights
+
+
+class _Fold(NamedTuple):
+    """What two elements, an axis of them, and sorted groups of them fold to, and what none do."""
+
+    two: Callable[[Any, Any], Any]
+    axis: Callable[..., Array]
+    sorted: Callable[..., Array]
+    empty: float
+
+
+_SUM = _Fold(operator.add, jnp.sum, jax.ops.segment_sum, 0.0)
+_MAX = _Fold(jnp.maximum, jnp.max, jax.ops.segment_max, -jnp.inf)
 
 
 class CompileClock:

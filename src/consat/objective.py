@@ -110,7 +110,7 @@ class Objective:
     Attributes:
         batches: the families.
         order: (M,) where each constraint, in the team's order, stands among the batches; None if they are in order already.
-        owners: groups the constraints by agent.
+        owners: groups the constraints, batch after batch, by agent.
         arguments: groups the arguments of all constraints, batch after batch, by row.
     """
 
@@ -132,6 +132,7 @@ class Objective:
         numbers = np.concatenate([np.zeros(0, dtype=np.int32), *(family.number for family in team.families)])
         in_order = np.array_equal(numbers, np.arange(len(numbers)))
         flat = np.concatenate([np.zeros(0, dtype=np.int32), *(place.ravel() for _, place in placed)])
+        owner = np.concatenate([np.zeros(0, dtype=np.int32), *(family.owner for family in team.families)])
         return cls(
             batches=tuple(
                 Batch(
@@ -143,7 +144,7 @@ class Objective:
                 for family, place in placed
             ),
             order=None if in_order else jnp.asarray(np.argsort(numbers), dtype=jnp.int32),
-            owners=Groups.of(team.owner, team.count),
+            owners=Groups.of(owner, team.count),
             arguments=Groups.of(flat, count),
         )
 
@@ -152,21 +153,24 @@ class Objective:
         """The objectives evaluated at one shared (N, d) array of positions, as an observer of the whole team sees them."""
         return cls.of(team, lambda family: family.agents, team.count)
 
-    def _in_order(self, values: list[Array]) -> Array:
-        flat = jnp.concatenate(values) if values else jnp.zeros(0)
-        return flat if self.order is None else flat[self.order]
+    def _in_order(self, by_batch: Array) -> Array:
+        return by_batch if self.order is None else by_batch[self.order]
+
+    def _values(self, x: Array) -> Array:
+        """(M,) every weighted ψ_ik, batch after batch."""
+        return jnp.concatenate([jnp.zeros(0), *(batch.values(x) for batch in self.batches)])
 
     def psi(self, x: Array) -> Array:
         """(M,) every weighted ψ_ik, in the team's order."""
-        return self._in_order([batch.values(x) for batch in self.batches])
+        return self._in_order(self._values(x))
 
     def agent_margins(self, x: Array) -> Array:
         """(N,) ᾱ_i, +∞ for an agent without constraints."""
-        return -self.owners.max(-self.psi(x))
+        return -self.owners.max(-self._values(x))
 
     def log_objective(self, x: Array, nu: Nu) -> Array:
         """(N,) ln f_i = −ν_β α_i, −∞ for an agent without constraints."""
-        return nu.beta / nu.alpha * self.owners.logsumexp(-nu.alpha * self.psi(x))[0]
+        return nu.beta / nu.alpha * self.owners.logsumexp(-nu.alpha * self._values(x))[0]
 
     def smooth_margin(self, x: Array, nu: Nu) -> Array:
         """β, the smooth margin of all agents together; scalar."""
@@ -174,20 +178,29 @@ class Objective:
 
     def multipliers(self, x: Array, nu: Nu) -> Array:
         """(M,) λ_ik = softmax over all agents and constraints, λ ∝ e^{−ν_β α_i} p_ik: how much each constraint binds."""
-        log_h, weights = self.owners.logsumexp(-nu.alpha * self.psi(x))
-        return self.owners.spread(jax.nn.softmax(nu.beta / nu.alpha * log_h)) * weights
+        log_h, weights = self.owners.logsumexp(-nu.alpha * self._values(x))
+        return self._in_order(self.owners.spread(jax.nn.softmax(nu.beta / nu.alpha * log_h)) * weights)
 
-    def ascent(self, x: Array, nu: Nu) -> tuple[Array, Array]:
-        """(N,) ln f_i and (rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the way each agent would go for its own constraints alone."""
-        pairs = [batch.gradients(x) for batch in self.batches]
-        log_h, weights = self.owners.logsumexp(-nu.alpha * self._in_order([values for values, _ in pairs]))
-        by_batch = weights if self.order is None else jnp.zeros_like(weights).at[self.order].set(weights, unique_indices=True)
-        pieces, start = [jnp.zeros((0, x.shape[-1]))], 0
-        for batch, (_, gradients) in zip(self.batches, pairs, strict=True):
-            stop = start + batch.rows.shape[0]
-            pieces.append((by_batch[start:stop, None, None] * gradients).reshape(-1, x.shape[-1]))
-            start = stop
-        return nu.beta / nu.alpha * log_h, self.arguments.sum(jnp.concatenate(pieces))
+    def ascent(self, x: Array, nu: Nu) -> Array:
+        """(rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the way each agent would go for its own constraints alone."""
+        return self._added_up(x, nu, lambda log_h, weights: weights)
+
+    def gradient(self, x: Array, nu: Nu) -> Array:
+        """(rows, d) ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)."""
+
+        def force(log_h: Array, weights: Array) -> Array:
+            return -nu.beta * self.owners.spread(jnp.exp(nu.beta / nu.alpha * log_h)) * weights
+
+        return self._added_up(x, nu, force)
+
+    def _added_up(self, x: Array, nu: Nu, weigh: Callable[[Array, Array], Array]) -> Array:
+        """(rows, d) the sum of all ∇ψ_ik, weighed by a function of ln Σ_k e^{−ν_α ψ_ik}, (N,), and p_ik, (M,)."""
+        values, gradients = zip(*(batch.gradients(x) for batch in self.batches), strict=True) if self.batches else ((), ())
+        weights = weigh(*self.owners.logsumexp(-nu.alpha * jnp.concatenate([jnp.zeros(0), *values])))
+        ends = np.cumsum([len(value) for value in values])[:-1]
+        pieces = [w[:, None, None] * g for w, g in zip(jnp.split(weights, ends), gradients, strict=True)] if gradients else []
+        flat = [piece.reshape(-1, x.shape[-1]) for piece in pieces]
+        return self.arguments.sum(jnp.concatenate([jnp.zeros((0, x.shape[-1])), *flat]))
 
 
 @jax.jit

@@ -23,7 +23,7 @@ from jax import Array
 from consat.objective import Nu
 from consat.prox.batches import SMALL_TEAM, Batch, Kind, Plan, buckets
 from consat.prox.lanes import Lanes
-from consat.prox.newton import MOST_ITERATIONS, STRONGEST, Found, Guess, Precision, cold, solve, solve_if_near
+from consat.prox.newton import MOST_ITERATIONS, STRONGEST, Found, Guess, Precision, cold, solve, solve_most
 
 __all__ = ["MOST_ITERATIONS", "SMALL_TEAM", "STRONGEST", "Guess", "Memory", "Plan", "Precision", "buckets", "recall", "step"]
 
@@ -73,17 +73,16 @@ def step(
     near, last, weight = _padded(v), _padded(x), _padded(kappa)
     offset = jnp.broadcast_to(offset, memory.sigma.shape)
 
-    def answers(solver: Callable[..., Found], batch: Batch, part: Part, skip: Array | None = None) -> tuple[Array, ...]:
+    def answers(solver: Callable[..., Found], batch: Batch, part: Part, guess: Guess | None = None, *rest: Array) -> tuple[Array, ...]:
         lanes = Lanes(batch, part.kinds, nu, offset[part.agents])
-        guess = Guess(_gathered(last, part.rows), memory.sigma[part.agents], memory.sharpness[part.agents])
-        given = {} if skip is None else {"skip": skip}
-        found = solver(lanes, _gathered(near, part.rows), weight[part.rows], guess, precision, **given)
+        guess = guess or Guess(_gathered(last, part.rows), memory.sigma[part.agents], memory.sharpness[part.agents])
+        found = solver(lanes, _gathered(near, part.rows), weight[part.rows], guess, precision, *rest)
         return jnp.moveaxis(found.guess.y, 1, -1), found.stiffness, found.guess.sigma, found.guess.sharpness, found.done
 
     found = []
     for batch in plan.batches:
         if precision.tolerance is None and len(batch.rows) > 1:
-            first = _by_chunk(batch, functools.partial(answers, solve_if_near))
+            first = _by_chunk(batch, functools.partial(answers, solve_most))
             found.append(_finish(batch, first, functools.partial(answers, solve)))
         else:
             found.append(_by_chunk(batch, functools.partial(answers, solve)))
@@ -125,9 +124,9 @@ def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]
     return tuple(jnp.concatenate(leaves) for leaves in zip(first, second, strict=True))
 
 
-def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[[Batch, Part, Array], tuple[Array, ...]]) -> tuple[Array, ...]:
+def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[..., tuple[Array, ...]]) -> tuple[Array, ...]:
     """The answers of those who are not done, gathered into chunks of their own, so that nobody waits for them; `first`: all answers so far,
-    the last of which says who is done."""
+    from which they go on, the last of which says who is done."""
     chunks, width = batch.agents.shape
     missing = ~first[-1].reshape(-1)
     place = jnp.cumsum(missing.astype(jnp.int32))
@@ -135,26 +134,21 @@ def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[[Batch, Par
     order = jnp.zeros(chunks * width, jnp.int32)
     order = order.at[jnp.where(missing, place - 1, chunks * width)].set(jnp.arange(chunks * width, dtype=jnp.int32), mode="drop")
 
-    def some(start: Array) -> tuple[Array, Array, list[Array]]:
+    def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        start, (y, stiffness, *numbers) = at
         mine = jax.lax.dynamic_slice(order, (start,), (width,))
         # the last slice is moved back where it would reach beyond the end
         spare = jnp.minimum(start, chunks * width - width) + jnp.arange(width, dtype=jnp.int32) >= total
         chunk, lane = mine // width, mine % width
         part = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[chunk, ..., lane], 0, -1), Part(batch.agents, batch.rows, batch.kinds))
-        y, stiffness, *numbers = solver(batch, part, spare)
+        guess = Guess(jnp.moveaxis(y[chunk, :, lane], 0, -1), numbers[0][chunk, lane], numbers[1][chunk, lane])
+        found = solver(batch, part, guess, spare)
+        chunk = jnp.where(spare, chunks, chunk)
         # the agents first, as they are when indexed
-        return jnp.where(spare, chunks, chunk), lane, [jnp.moveaxis(y, 1, 0), jnp.moveaxis(stiffness, 1, 0), *numbers]
-
-    def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
-        start, answers = at
-        side_by_side = 2 if chunks >= MANY else 1
-        for chunk, lane, found in [some(start + k * width) for k in range(side_by_side)]:
-            y, stiffness, *numbers = answers
-            y = y.at[chunk, :, lane].set(found[0], mode="drop")
-            stiffness = stiffness.at[chunk, :, lane].set(found[1], mode="drop")
-            put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
-            answers = y, stiffness, *put
-        return start + side_by_side * width, answers
+        y = y.at[chunk, :, lane].set(jnp.moveaxis(found[0], 1, 0), mode="drop")
+        stiffness = stiffness.at[chunk, :, lane].set(jnp.moveaxis(found[1], 1, 0), mode="drop")
+        put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
+        return start + width, (y, stiffness, *put)
 
     return jax.lax.while_loop(lambda at: at[0] < total, more, (jnp.asarray(0, jnp.int32), first))[1]
 

@@ -22,6 +22,8 @@ LONGEST_STEP = 3.0
 """σ rises by at most this much at a time where y answers to it: beyond, the linear model of y says nothing."""
 STRONGEST = 1e12
 """Where the multiplier outweighs κ by this much, an agent already does all it can for its own constraints, and σ stays."""
+UNSEARCHED = 2
+"""Steps of a chunk that go without a line search."""
 SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
 """Parts of a step that a line search tries."""
 
@@ -129,11 +131,17 @@ def solve(
     return task.found(jax.lax.while_loop(lambda at: jnp.any(~at.done), task.step, start))
 
 
-def solve_if_near(lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision) -> Found:
-    """The first step of `solve` for those that are within reach of the solution, which is all that a `Precision` without tolerance asks of
-    them, at a fraction of its cost; the others are not done, and where they were."""
+def solve_most(lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision) -> Found:
+    """The first steps of `solve`, without its searches and brackets, at a fraction of its cost, until most of the chunk are within reach of
+    the solution, which is all that a `Precision` without tolerance asks of them. The others are not done, but nearer."""
     task = _Task.of(lanes, v, kappa, precision)
-    return task.found(task.one_step(task.start(guess)))
+
+    def goes_on(at: tuple[Array, _Search]) -> Array:
+        number, search = at
+        return (number < UNSEARCHED) & (2 * jnp.sum(~search.done) > len(search.done))
+
+    start = jnp.asarray(0), task.start(guess)
+    return task.found(jax.lax.while_loop(goes_on, lambda at: (at[0] + 1, task.plain_step(at[1])), start)[1])
 
 
 class _Task(NamedTuple):
@@ -203,16 +211,20 @@ class _Task(NamedTuple):
             done=done | last | tired,
         )
 
-    def one_step(self, at: _Search) -> _Search:
-        """The first step, of those that are within reach of the solution already; the others are left as they are."""
+    def plain_step(self, at: _Search) -> _Search:
+        """A step of Newton in every lane that is not done, and the last of those that begin it within reach of the solution; y alone moves
+        where they don't."""
         here = self.look(at)
         wanted = jnp.minimum(here.wanted(dot(here.model.slope, here.ahead.descend)), here.ceiling)
-        done = here.near & (at.sharpness >= 1.0)
+        last = here.near & (at.sharpness >= 1.0)
+        sigma = jnp.where(last, wanted, here.sigma)
+        y = at.y + here.ahead.to(sigma - here.sigma)
+        moves = ~at.done & jnp.isfinite(add_up(y))
         return at._replace(
-            y=jnp.where(done[None], at.y + here.ahead.to(wanted - here.sigma), at.y),
-            sigma=jnp.where(done, wanted, at.sigma),
-            stiffness=self.stiffness(here),
-            done=done,
+            y=jnp.where(moves[None], y, at.y),
+            sigma=jnp.where(at.done, at.sigma, sigma),
+            stiffness=jnp.where(at.done[None], at.stiffness, self.stiffness(here)),
+            done=at.done | last,
         )
 
     def look(self, at: _Search) -> _Here:

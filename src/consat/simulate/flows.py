@@ -47,14 +47,12 @@ class Problem:
     Attributes:
         objective: over the rows of the state.
         exchange: the messages.
-        holder: (C,) who holds each row.
         own: (C, 1) 1.0 where the holder's own position stands.
         schedule: of ν.
     """
 
     objective: Objective
     exchange: Exchange
-    holder: Array
     own: Array
     schedule: Schedule
 
@@ -62,7 +60,7 @@ class Problem:
     def of(cls, team: Team, estimates: Estimates, schedule: Schedule) -> Problem:
         objective = Objective.of(team, lambda family: estimates.rows(family.owner[:, None], family.agents), estimates.count)
         own = (estimates.holder == estimates.position)[:, None].astype(float)
-        return cls(objective, estimates.exchange(), jnp.asarray(estimates.holder), jnp.asarray(own), schedule)
+        return cls(objective, estimates.exchange(), jnp.asarray(own), schedule)
 
 
 @dataclass(frozen=True)
@@ -77,11 +75,10 @@ class Everyone:
         return self.problem.own
 
     def ascent(self, x: Array) -> Array:
-        return self.problem.objective.ascent(x, self.nu)[1]
+        return self.problem.objective.ascent(x, self.nu)
 
     def gradient(self, x: Array) -> Array:
-        log_f, ascent = self.problem.objective.ascent(x, self.nu)
-        return -self.nu.beta * jnp.exp(log_f)[self.problem.holder, None] * ascent
+        return self.problem.objective.gradient(x, self.nu)
 
 
 @jax.tree_util.register_dataclass
