@@ -91,7 +91,8 @@ def explain(team: Team, optimum: Optimum) -> list[str]:
 
 
 def _binding(multipliers: Floats, mine: Bools) -> list[int]:
-    heavy = np.flatnonzero(mine & (multipliers > BINDING))
+    """Which constraints bind, the strongest first: in a large team each bears a small part."""
+    heavy = np.flatnonzero(mine & (multipliers > BINDING * np.max(multipliers[mine], initial=0.0)))
     return [int(k) for k in heavy[np.argsort(-multipliers[heavy], kind="stable")]]
 
 

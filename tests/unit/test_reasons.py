@@ -99,6 +99,12 @@ def test_a_feasible_team_is_told_what_limits_it() -> None:
     assert said.startswith("Every constraint can hold. The best margin that can be is 0.1861, limited by a2's near(a3)")
 
 
+def test_of_many_that_bind_a_little_each_some_are_named() -> None:
+    (said,) = sentences(cs.load("convoy", ["count=2500"]).team)
+    assert "limited by a1's goal" in said
+    assert "and 2494 more" in said
+
+
 def test_teams_without_limits() -> None:
     assert sentences(cs.Team([A("a")])) == ["No agent has a constraint."]
     assert "Nothing limits" in sentences(cs.Team([A("a", [cs.halfspace([1, 0], 1)])]))[0]
