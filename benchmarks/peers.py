@@ -62,7 +62,7 @@ def lanes(steps: np.ndarray, first: np.ndarray, nu: Nu) -> Lanes:
 def _difference(links: Any, x: Array, weight: Array | float) -> Array:
     """Σ_j w_ij (x_i − x_j)."""
     at = links.at(x)
-    return links.sum(weight * (at - at[links.other]))
+    return links.sum(weight * (at - links.across(at)))
 
 
 def _flow_begin(x: Array, *_: Any) -> Any:

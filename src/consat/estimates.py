@@ -95,13 +95,18 @@ class Estimates:
         keys = self.holder.astype(np.int64) * count + self.position
         return np.searchsorted(keys, holder.astype(np.int64) * count + position).astype(np.int32)
 
+    def ends(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Both ends of every link of every row: (B,) receivers, in order, (B,) senders, and how many rows make a block, in which both are
+        counted: agents' whole estimates where everyone holds everything, which makes one Laplacian for all positions; else single rows."""
+        agents = len(self.own)
+        if self.count == agents**2 and self.count:
+            return *_both_ways(self.links, agents), agents
+        return self.edges[:, 0], self.edges[:, 1], 1
+
     def exchange(self) -> Exchange:
         """The edges as arrays for the device."""
-        agents = len(self.own)
-        if self.count == agents**2 and self.count:  # everyone holds everything: one Laplacian for all positions
-            here, there = _both_ways(self.links, agents)
-            return Exchange(jnp.asarray(there), Groups.of(here, agents), agents)
-        return Exchange(jnp.asarray(self.edges[:, 1]), Groups.of(self.edges[:, 0], self.count), 1)
+        receiver, sender, block = self.ends()
+        return Exchange(jnp.asarray(sender), Groups.of(receiver, self.count // block), block)
 
 
 def _everyone(cluster: np.ndarray) -> np.ndarray:

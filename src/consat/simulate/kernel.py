@@ -34,38 +34,52 @@ class Ends:
     """Both ends of every link of every copy: `consat.protocols.Links` of all agents at once.
 
     Attributes:
-        row: (E,) the copy at this end.
-        other: (E,) the index of the same link's other end.
-        groups: groups the ends by copy.
+        other: (B,) the index of the same link's other end, in blocks of copies; see `consat.estimates.Estimates.ends`.
+        groups: groups the ends by copy, in blocks.
         degree: (C,).
         metropolis: (E,).
+        block: copies in a block.
     """
 
-    row: Array
     other: Array
     groups: Groups
     degree: Array
     metropolis: Array
+    block: int = field(metadata={"static": True})
 
     @classmethod
     def of(cls, copies: Estimates) -> Ends:
-        receiver, sender = copies.edges.T.astype(np.int64)
-        other = np.searchsorted(receiver * copies.count + sender, sender * copies.count + receiver)
-        degree = np.bincount(receiver, minlength=copies.count)
+        receiver, sender, block = copies.ends()
+        here, there, count = receiver.astype(np.int64), sender.astype(np.int64), copies.count // block
+        other = np.searchsorted(here * count + there, there * count + here)
+        degree = np.bincount(receiver, minlength=count)
         metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
         return cls(
-            jnp.asarray(receiver.astype(np.int32)),
             jnp.asarray(other.astype(np.int32)),
-            Groups.of(receiver, copies.count),
-            jnp.asarray(degree.astype(float)),
-            jnp.asarray(metropolis),
+            Groups.of(receiver, count),
+            jnp.asarray(np.repeat(degree.astype(float), block)),
+            jnp.asarray(np.repeat(metropolis, block)),
+            block,
         )
 
+    def __len__(self) -> int:
+        return len(self.metropolis)
+
     def at(self, rows: Array) -> Array:
-        return self.groups.spread(rows)
+        return self._in_blocks(self.groups.spread, rows)
 
     def sum(self, links: Array) -> Array:
-        return self.groups.sum(links)
+        return self._in_blocks(self.groups.sum, links)
+
+    def across(self, links: Array) -> Array:
+        """(E, …) → (E, …): what stands at the other ends."""
+        return self._in_blocks(lambda blocks: blocks[self.other], links)
+
+    def _in_blocks(self, function: Callable[[Array], Array], values: Array) -> Array:
+        if self.block == 1:
+            return function(values)
+        found = function(values.reshape(-1, self.block, *values.shape[1:]))
+        return found.reshape(-1, *found.shape[2:])
 
 
 @jax.tree_util.register_dataclass
@@ -270,7 +284,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     state, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
     ages, told = agreement.speak(now.ages, state.x, everyone)
     key, went = now.key, None
-    sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends.row))
+    sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
     counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
     if world.rough:
         key, awake, through = _luck(world, now.key)
@@ -282,7 +296,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     if counted is not None:
         sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
         copies_sent = jnp.sum(counted)
-    floats = sent + copies_sent * sum(leaf.size // max(len(ends.row), 1) for leaf in jax.tree.leaves(message))
+    floats = sent + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in jax.tree.leaves(message))
     return Spoken(state, ages, message, told, went, key, sent, floats)
 
 
@@ -301,9 +315,9 @@ def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
 def hear(protocol: Rounds, world: World, now: Now, spoken: Spoken) -> tuple[Now, Array]:
     """The second half of a round; tells also whether everybody knows that all are satisfied."""
     everyone, ends = world.everyone, world.everyone.links
-    arrived = jnp.ones(len(ends.row), dtype=bool) if spoken.went is None else spoken.went[ends.other]
-    state = protocol.hear(spoken.state, jax.tree.map(lambda leaf: leaf[ends.other], spoken.message), arrived, everyone)
-    ages = agreement.hear(spoken.ages, spoken.told[ends.other], arrived)
+    arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
+    state = protocol.hear(spoken.state, jax.tree.map(ends.across, spoken.message), arrived, everyone)
+    ages = agreement.hear(spoken.ages, ends.across(spoken.told), arrived)
     target = state.x[world.own]
     away = target - now.body
     distance = jnp.linalg.norm(away, axis=1, keepdims=True)
@@ -359,23 +373,23 @@ def world_of(
 ) -> World:
     """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; partial: whether it is of one process
     among several, which must know whose messages to count."""
-    ends = Ends.of(copies)
+    receiver, sender, block = copies.ends()
+    talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
-        links=ends,
+        links=Ends.of(copies),
         length=jnp.asarray(size.length),
         region=Region.of(size),
         plan=prox.buckets(team, copies.rows, copies.count, convex),
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
         holder=jnp.asarray(copies.holder),
-        talkers=Groups.of(copies.holder[copies.edges[:, 0]], team.count),
+        talkers=Groups.of(talker, team.count),
         agents=team.count,
         hops=hops(team.count, copies.links),
         convex=convex,
         precision=precision_for(team.count),
     )
     rough = weather.loss > 0 or weather.sleep > 0
-    talker, listener = copies.holder[copies.edges[:, 0]], copies.holder[copies.edges[:, 1]]
     keys = talker.astype(np.int64) * team.count + listener
     pairs = distinct(keys)
     if not (rough or partial):  # then nobody asks who is at the ends
