@@ -24,9 +24,9 @@ import consat as cs
 from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Objective, Schedule
+from consat.preparation import first_estimates
 from consat.protocols import ROUNDS
 from consat.quadratics import shape_of
-from consat.runner import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
 

@@ -215,7 +215,7 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     """Find the best margin centrally, prove it, and say what stands in the way."""
     _cache_compilations()
     loaded = _load(scenario, overrides)
-    from consat.runner import solve as solve_team
+    from consat.solving import solve as solve_team
     from consat.views import tables
 
     with located(loaded):
