@@ -36,7 +36,7 @@ from consat.numerics import float64
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import FLOWS, ROUNDS, State
 from consat.quadratics import shape_of
-from consat.runner import first_estimates
+from consat.preparation import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
 from consat.simulate.flows import Problem, rate

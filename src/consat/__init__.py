@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
     from consat.groups import Group, each
     from consat.result import Result
-    from consat.runner import resume, run, solve
+    from consat.runner import resume, run
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
+    from consat.solving import solve
     from consat.sweeping import Sweep, sweep
     from consat.team import Agent, Team
 
@@ -27,7 +28,8 @@ _HOME = {
     ),
     "groups": ("Group", "each"),
     "result": ("Result",),
-    "runner": ("resume", "run", "solve"),
+    "runner": ("resume", "run"),
+    "solving": ("solve",),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "sweeping": ("Sweep", "sweep"),

@@ -16,18 +16,30 @@ import click
 from consat import __version__
 from consat.errors import ConsatError, InvalidInput, InvalidSettings
 from consat.network.commands import agent, launch, split
+from consat.network.environment import keep_compilations
 from consat.network.keys_command import keys
+from consat.terminal import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    INVALID,
+    UNSATISFIED,
+    USAGE,
+    estimates_option,
+    full_option,
+    json_option,
+    located,
+    out_option,
+    scenario_argument,
+    set_option,
+    tell,
+)
 
 if TYPE_CHECKING:
     from consat.scenario import Scenario
 
 PATIENCE = 2000
 """Rounds, or seconds of a flow, that a run may take when nobody says."""
-DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
-
-scenario_argument = click.argument("scenario", metavar="FILE")
-set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
 
 
 def main() -> NoReturn:
@@ -93,7 +105,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.argument("scenario", metavar="FILE", required=False)
 @set_option
 @click.option("--protocol", metavar="KIND", help="admm (default), proximal, max-min, gradient-flow, proportional-integral, selfish.")
-@click.option("--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything.")
+@estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
 @click.option("--rounds", type=click.IntRange(min=0), help="How many rounds; implies --stop never.")
 @click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End of a flow; implies --stop never.")
@@ -103,7 +115,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, for bodies that cannot jump.")
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there.")
+@out_option
 @click.option("--every", type=click.IntRange(min=1), default=1, metavar="K", help="Record each K-th round, or sample of a flow.")
 @click.option(
     "--record",
@@ -121,7 +133,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--coordinator", metavar="HOST:PORT", help="Join others: where process 0 listens; see docs/cluster.md.")
 @click.option("--process", type=click.IntRange(min=0), metavar="I", help="Number of this process among them, from 0.")
 @click.option("--of", type=click.IntRange(min=1), metavar="K", help="How many they are.")
-@click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
+@full_option
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @json_option
 def run(
@@ -136,7 +148,7 @@ def run(
     loaded = None if scenario is None else _load(scenario, overrides)
     from consat import runner
 
-    with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, _located(loaded):
+    with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, located(loaded):
         if loaded is None:
             kept = {key: settings[key] for key in ("rounds", "until", "checkpoint")}
             result = runner.resume(cast(Path, resume), full=full, progress=progress, **kept)
@@ -148,13 +160,7 @@ def run(
         figures = result.plot(out)
         if not (quiet or as_json):
             _say(f"written: {', '.join(str(path) for path in (out / 'result.nc', *figures))}")
-    if as_json:
-        click.echo(json.dumps(result.summary))
-    elif not quiet:
-        click.echo(str(result))
-    if result.summary["ending"] == "interrupted":
-        return INTERRUPTED
-    return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+    return tell(result, quiet=quiet, as_json=as_json)
 
 
 def _meet(processes: int | None, coordinator: str | None, process: int | None, of: int | None) -> bool:
@@ -194,7 +200,7 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
         click.echo(json.dumps(findings))
     else:
         _show(tables.check(loaded.name, findings))
-    with _located(loaded):
+    with located(loaded):
         require_connected(loaded.team)
     return DONE
 
@@ -209,10 +215,10 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     """Find the best margin centrally, prove it, and say what stands in the way."""
     _cache_compilations()
     loaded = _load(scenario, overrides)
-    from consat.runner import solve as solve_team
+    from consat.solving import solve as solve_team
     from consat.views import tables
 
-    with _located(loaded):
+    with located(loaded):
         answer = solve_team(loaded, seed=seed, auxiliary=auxiliary)
     if answer["auxiliary"] is not None:
         _say_auxiliary(answer["auxiliary"]["radius"], answer["auxiliary"]["binding"])
@@ -259,7 +265,7 @@ def sweep(
     from consat.views import tables
 
     options = {path.strip(): values(text) for path, _, text in (each.partition("=") for each in over)}
-    with _progress(as_json, share=True) as progress, _located(loaded):
+    with _progress(as_json, share=True) as progress, located(loaded):
         found = sweep_team(loaded, options, progress=progress, **settings)
     if out is not None:
         _say(f"written: {', '.join(map(str, found.save(out)))}")
@@ -304,25 +310,10 @@ def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:
     return load(scenario, overrides)
 
 
-@contextmanager
-def _located(scenario: Scenario | None) -> Iterator[None]:
-    """Faults that show only later, such as a cluster without links, get their place in the file."""
-    from consat.scenario import located
-
-    try:
-        yield
-    except InvalidInput as error:
-        raise error if scenario is None else located(error, scenario) from None
-
-
 def _cache_compilations() -> None:
     """Keep compiled programs between runs, in the user's own cache directory; must come before JAX starts."""
     os.environ.setdefault("EQX_ON_ERROR", "nan")  # its error callback would forbid caching; the results carry their own status
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    keep_compilations(os.environ)
 
 
 @contextmanager

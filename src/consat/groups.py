@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from consat.constraints.record import OWNER, Constraint, Number, Vector
+from consat.constraints.record import OWNER, Constraint, Number, Vector, flatten
 from consat.errors import Fault, closest, shown
 from consat.family import Counted, Derived, Part, Repeated
 from consat.parameters import LARGEST, Path, checked, checked_rows, is_number
@@ -208,7 +208,7 @@ class Expansion:
         for k, item in enumerate(self.group.constraints):
             path = (*self.path, "constraints", k)
             outer = item if isinstance(item, Each) else Each(item)
-            for constraint in _flatten(outer.constraint):
+            for constraint in flatten(outer.constraint):
                 if isinstance(constraint, Constraint):
                     yield path, replace(outer, constraint=constraint)
                 elif isinstance(constraint, Each):
@@ -402,14 +402,6 @@ class Expansion:
 
 def _fixed(parameter: Any) -> bool:
     return not isinstance(parameter, Number | Vector)
-
-
-def _flatten(item: Any) -> Iterator[Any]:
-    if isinstance(item, list | tuple):
-        for part in item:
-            yield from _flatten(part)
-    else:
-        yield item
 
 
 def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:

@@ -20,14 +20,16 @@ from consat.certificate import bounds
 from consat.errors import InvalidSettings
 from consat.estimates import Layout
 from consat.numerics import float64
+from consat.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.protocols import FLOWS, ROUNDS, with_gains
-from consat.runner import Prepared, number, run, scenario_of, settings_of, status_of, with_auxiliary
+from consat.runner import run
 from consat.scenario import Scenario, loads
 from consat.settings import Start
 from consat.simulate import Stop
 from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
 from consat.simulate.kernel import Weather, world_of
 from consat.simulate.rounds import PATIENCE, Rules, stillness
+from consat.summary import number, status_of
 from consat.team import Team
 
 SCHEMA = "consat.sweep/1"
@@ -217,8 +219,6 @@ class _Asked:
             scenario = with_auxiliary(scenario, self.auxiliary)
         settings = settings_of(scenario.settings, self.given)
         kind = settings.protocol.kind
-        if kind not in FLOWS and kind not in ROUNDS:
-            raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
         if (kind in FLOWS and (self.rounds or self.loss or self.sleep)) or (kind in ROUNDS and self.until):
             raise InvalidSettings(
                 f"protocol {kind} is none to which all of these settings mean anything: until is for flows, the rest for rounds"

@@ -5,25 +5,21 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consat.constraints.record import OWNER, Constraint, Number
-from consat.errors import Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.constraints.record import OWNER, Constraint, Number, flatten
+from consat.entries import SUGGESTIONS, Entry, alike, trace
+from consat.errors import Fault, InvalidTeam, closest, shown
 from consat.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.groups import Expansion, Group, faults_of, stems_clash
-from consat.numerics import float64
 from consat.parameters import Path, checked, vector
 
 if TYPE_CHECKING:
     import networkx as nx
-
-SUGGESTIONS = 20
-"""Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
 
 MOST_NAMED = 100_000
 """Up to so many constraints have their names made at once; of more, a name is made when asked for."""
@@ -97,9 +93,9 @@ class Team:
         self.starts = np.full((index.count, self.dimension), np.nan)
         self.around = None
         entries = list(_entries(index, self.dimension, faults))
-        parts = _alike(entries)
+        parts = alike(entries)
         if dimension:
-            _trace(entries, self.dimension, faults)
+            trace(entries, self.dimension, faults)
             for k, i, agent in index.singles:
                 if agent.start is not None:
                     start = vector(agent.start, self.dimension, ("agents", k, "start"), "start", _who(k, agent.id), faults)
@@ -126,11 +122,11 @@ class Team:
             self.around[0][mine], self.around[1][mine] = expansion.layout.places, group.scatter
         made = expansion.parts()
         entries = [
-            _Entry(constraint, first, tuple(range(part.agents.shape[1])), "", at, where, {k: v[0] for k, v in part.parameters.items()})
+            Entry(constraint, first, tuple(range(part.agents.shape[1])), "", at, where, {k: v[0] for k, v in part.parameters.items()})
             for part, constraint, at, where in made
             if len(part.owner)
         ]
-        _trace(entries, self.dimension, faults)
+        trace(entries, self.dimension, faults)
         return [part for part, *_ in made if len(part.owner)]
 
     def with_constraints(self, families: Iterable[Family], owner: np.ndarray, names: Sequence[str]) -> Team:
@@ -183,25 +179,6 @@ class Team:
 
     def __repr__(self) -> str:
         return f"Team({self.count} agents, {len(self.owner)} constraints, {len(self.links)} links, dimension={self.dimension})"
-
-
-@dataclass
-class _Entry:
-    """One constraint on its way into a family."""
-
-    constraint: Constraint
-    owner: int
-    agents: tuple[int, ...]
-    name: str
-    path: Path
-    where: str
-    values: dict[str, np.ndarray] = field(default_factory=dict)
-    weight: float = 1.0
-
-    @property
-    def family(self) -> tuple[Any, ...]:
-        shapes = tuple((key, value.shape) for key, value in sorted(self.values.items()))
-        return self.constraint.psi, len(self.agents), shapes
 
 
 class Index:
@@ -289,13 +266,13 @@ def _who(i: int, name: Any) -> str:
     return f"agent {name!r}" if isinstance(name, str) and name.strip() else f"agents[{i}]"
 
 
-def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[_Entry]:
+def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[Entry]:
     for number, i, agent in index.singles:
         taken: dict[str, int] = {}
         who = _who(number, agent.id)
         for k, item in enumerate(agent.constraints):
             path: Path = ("agents", number, "constraints", k)
-            for constraint in _flatten(item):
+            for constraint in flatten(item):
                 if not isinstance(constraint, Constraint):
                     faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", who))
                     continue
@@ -303,7 +280,7 @@ def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[_Ent
                 name = _name(constraint, taken, path, agent.id, who, faults)
                 where = f"{who}, constraint {name!r}"
                 reads = _reads(constraint, agent.id, index, path, where, faults)
-                entry = _Entry(constraint, i, reads, name, path, where)
+                entry = Entry(constraint, i, reads, name, path, where)
                 for key, parameter in constraint.parameters.items():
                     value = checked(parameter, dimension, (*path, key), key, where, faults)
                     if value is not None:
@@ -312,14 +289,6 @@ def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[_Ent
                 entry.weight = 1.0 if weight is None else float(weight)
                 if len(faults) == named and reads:
                     yield entry
-
-
-def _flatten(item: Any) -> Iterator[Any]:
-    if isinstance(item, list | tuple):
-        for part in item:
-            yield from _flatten(part)
-    else:
-        yield item
 
 
 def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, who: str, faults: list[Fault]) -> str:
@@ -359,74 +328,6 @@ def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: 
         itself = "its own owner" if repeated == owner else "the same agent twice"
         faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
     return tuple(index[agent] for agent in reads)
-
-
-@float64
-def _trace(entries: Iterable[_Entry], dimension: int, faults: list[Fault]) -> None:
-    """Trace ψ once a family: whatever a user's function does wrong shows here, before anything runs."""
-    seen: dict[tuple[Any, ...], Fault | None] = {}
-    for entry in entries:
-        first = entry.family not in seen
-        fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
-        if fault is not None and not first:
-            written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
-            # Equal expressions may be written differently: each has its own columns.
-            again = _untraceable(entry, dimension) if written else None
-            fault = again or replace(fault, path=(*entry.path, *fault.path[len(entry.path) :]), where=entry.where, offset=0)
-        if fault is not None:
-            faults.append(fault)
-
-
-def _untraceable(entry: _Entry, dimension: int) -> Fault | None:
-    message, offset = _mistake(entry, dimension)
-    key: Path = ("psi",) if entry.constraint.source is not None else ()
-    return Fault((*entry.path, *key), message, entry.where, offset) if message else None
-
-
-def _mistake(entry: _Entry, dimension: int) -> tuple[str, int]:
-    """What is wrong with ψ, and where in its text; an empty message if nothing is."""
-    position = jax.ShapeDtypeStruct((dimension,), np.dtype(float))
-    try:
-        shape = jax.eval_shape(functools.partial(entry.constraint.psi, **entry.values), *(position,) * len(entry.agents))
-    except InvalidExpression as error:
-        return error.message, error.column
-    except Exception as error:  # noqa: BLE001 - whatever the user's own function raises is a fault of the input
-        reason = str(error).strip().split("\n")[0]
-        return f"ψ cannot be traced by JAX in dimension {dimension}: {reason or type(error).__name__}", 0
-    leaves = jax.tree.leaves(shape)
-    if len(leaves) != 1 or leaves[0].shape != ():
-        return f"ψ must return one number, but returns {', '.join(f'shape {leaf.shape}' for leaf in leaves) or 'nothing'}", 0
-    if not np.issubdtype(leaves[0].dtype, np.floating):
-        return f"ψ must return a real number, but returns {leaves[0].dtype}; constraints must be differentiable", 0
-    return "", 0
-
-
-def _alike(entries: Sequence[_Entry]) -> list[Part]:
-    """Constraints that share a family, together."""
-    members: dict[tuple[Any, ...], list[_Entry]] = {}
-    turns: dict[tuple[Any, ...], list[int]] = {}
-    for turn, entry in enumerate(entries):
-        members.setdefault(entry.family, []).append(entry)
-        turns.setdefault(entry.family, []).append(turn)
-    return [
-        Part(
-            kind=group[0].constraint.kind,
-            psi=group[0].constraint.psi,
-            agents=np.array([entry.agents for entry in group], dtype=np.int32),
-            owner=np.array([entry.owner for entry in group], dtype=np.int32),
-            parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
-            weight=np.array([entry.weight for entry in group]),
-            names=tuple(entry.name for entry in group),
-            sources=_sources(group),
-            turn=np.array(turns[family]),
-        )
-        for family, group in members.items()
-    ]
-
-
-def _sources(entries: Sequence[_Entry]) -> tuple[str, ...] | None:
-    texts = tuple(entry.constraint.source for entry in entries if entry.constraint.source is not None)
-    return texts if len(texts) == len(entries) else None
 
 
 def _pairs(links: Links, index: Index, faults: list[Fault]) -> np.ndarray | None:

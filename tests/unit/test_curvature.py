@@ -14,6 +14,7 @@ import pytest
 from consat.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
 from consat.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
 from consat.constraints.functions import safe_norm
+from consat.constraints.node import Node
 
 STRICTLY, CONCAVE, UNKNOWN, NOT = Curvature
 PARAMETERS = {"a": 2.0, "b": -0.5, "c": np.array([1.0, -2.0])}
@@ -396,7 +397,7 @@ def test_far_from_the_origin() -> None:
 
 def test_norm_needs_no_eigenvalue(monkeypatch: pytest.MonkeyPatch) -> None:
     """That a sum of squares is ≥ 0, hence its root a cone, follows from bounds alone, and so holds whatever the rounding."""
-    monkeypatch.setattr(composition, "_nonnegative", lambda q, *_: np.zeros(1, bool))
+    monkeypatch.setattr(Node, "nonnegative", lambda q, *_: np.zeros(1, bool))
     assert read_curvature(lambda x, y, c: 1 - safe_norm(x - y - c), 2, 3, {"c": np.array([1e7, 0.1, 1e-3])}).curvature == CONCAVE
 
 

@@ -3,179 +3,21 @@
 The rules are those of disciplined convex programming (Grant, Boyd, Ye 2006, "Disciplined convex programming", section 6; Boyd,
 Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5), with two additions: polynomials of degree ≤ 2 are carried along exactly,
 coefficients and all, and sums of exponentials are known to be log-convex.
-
-A `Node` describes an array, element by element, and a whole family of functions at once. The axes of its arrays are
-(members, *shape, *more); any of them may have length 1 and then stands for equal entries.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import reduce
 from itertools import zip_longest
-from typing import Any, Final, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
-
-ROUNDING: Final = 1e-12
-"""An eigenvalue below this, per row of its matrix, is zero, once every coordinate is scaled such that the terms summed into the matrix
-are at most 1. That is some thousand roundings, more than any constraint makes."""
-
-
-def signs(matrix: Array, size: Array, rounding: float = ROUNDING) -> tuple[Array, Array]:
-    """Signs of the smallest and the largest eigenvalue of symmetric matrices; −1 and 1 if not finite.
-
-    By Sylvester's law of inertia a congruence keeps them, so each coordinate is first scaled to a unit of its own, such that no row of
-    `size`, which bounds the terms that were added up to `matrix`, exceeds 1. What then lies below `rounding`, per row, counts as 0.
-    """
-    matrix, size = np.broadcast_arrays(matrix, size)
-    finite = np.asarray(np.isfinite(size + matrix).all((-1, -2)))
-    matrix, size = (np.where(finite[..., None, None], each, 0) for each in (matrix, size))
-    scale = np.ones(size.shape[:-1])
-    for _ in range(8):  # Ruiz equilibration
-        row = np.max(size * scale[..., :, None] * scale[..., None, :], axis=-1)
-        if np.all((row == 0) | (np.abs(row - 1) < 0.5)):
-            break
-        scale /= np.sqrt(np.where(row > 0, row, 1))
-    eigenvalues = np.linalg.eigvalsh(matrix * scale[..., :, None] * scale[..., None, :])
-    eigenvalues[np.abs(eigenvalues) <= rounding * matrix.shape[-1]] = 0
-    return np.where(finite, np.sign(eigenvalues[..., 0]), -1), np.where(finite, np.sign(eigenvalues[..., -1]), 1)
-
-
-def block(matrix: Array, slot: int | None) -> Array:
-    """Of a Hessian (…, arity, d, arity, d) the (d, d) block of one position, or if None all of it as a square matrix."""
-    n = math.prod(matrix.shape[-2:])
-    return matrix.reshape(*matrix.shape[:-4], n, n) if slot is None else matrix[..., slot, :, slot, :]
-
-
-# ----------------------------------------------------------------------------------------------------------------- the node
-
-
-class Bend(NamedTuple):
-    """How a function bends, proven element by element. Affine is both convex and concave.
-
-    Attributes:
-        convex: bool.
-        concave: bool.
-        logconvex: bool; positive, with a convex logarithm (hence convex).
-        strict: bool, with one more axis of length arity + 2. Given that the element is convex or concave, whether it is
-            strictly so: jointly, in each position alone, and (last) in the weakest sense, not affine.
-    """
-
-    convex: Array
-    concave: Array
-    logconvex: Array
-    strict: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Node:
-    """What an intermediate array is as a function of the positions.
-
-    Attributes:
-        shape: of the array.
-        degree: bound on the polynomial degree, if proven to be ≤ 2.
-        low: lower bound, where the function is defined.
-        high: upper bound, likewise.
-        terms: (c, b, H) of c + b·x + ½ xᵀHx up to the degree, if known: b has two more axes (arity, d), H four.
-        sizes: the same sums with every term positive: what rounding errors are relative to.
-        rule: how it bends, for lack of terms.
-        made: by which rule and of what, for rules that look further back than one step.
-    """
-
-    shape: tuple[int, ...]
-    degree: int | None
-    low: Array
-    high: Array
-    terms: tuple[Array, ...] | None = None
-    sizes: tuple[Array, ...] = ()
-    rule: Bend | None = None
-    made: tuple[str, tuple[Node, ...]] = ("", ())
-
-    @property
-    def value(self) -> Array | None:
-        """The value of a known constant."""
-        return self.terms[0] if self.terms is not None and self.degree == 0 else None
-
-    @cached_property
-    def bend(self) -> Bend:
-        """How it bends; of a quadratic by its eigenvalues."""
-        one, more = (1,) * (len(self.shape) + 1), (1,)
-        no, yes, none = np.zeros(one, bool), np.ones(one, bool), np.zeros(one + more, bool)
-        if self.value is not None:
-            finite = np.isfinite(self.value)
-            return Bend(finite, finite, finite & (self.value > 0), none)
-        if self.degree in {0, 1}:
-            return Bend(yes, yes, no, none)
-        if self.terms is None:
-            return self.rule or Bend(no, no, no, none)
-        hessian, size = self.terms[2], self.sizes[2]
-        slots = (None, *range(hessian.shape[-2]))
-        least, largest = np.stack([signs(block(hessian, slot), block(size, slot)) for slot in slots], axis=-1)
-        convex, concave = least[..., 0] >= 0, largest[..., 0] <= 0
-        strict = np.concatenate([np.where(convex[..., None], least > 0, largest < 0), ~(convex & concave)[..., None]], axis=-1)
-        return Bend(convex, concave, no, strict)
-
-    @cached_property
-    def bounds(self) -> tuple[Array, Array]:
-        """`low` and `high`, sharpened by the sign of a quadratic, if it is clear."""
-        if self.degree != 2 or self.terms is None:
-            return self.low, self.high
-        above, below = _nonnegative(self, 1e-9), _nonnegative(negative(self), 1e-9)
-        return np.where(above, np.maximum(self.low, 0), self.low), np.where(below, np.minimum(self.high, 0), self.high)
-
-
-def _nonnegative(q: Node, margin: float, rounding: float = ROUNDING) -> Array:
-    """Whether a quadratic is ≥ 0 everywhere, even if its constant term were less by `margin`: iff [[H, b], [bᵀ, 2c]] is so definite."""
-    matrix, size = _lifted(q.terms or ()), _lifted(q.sizes)
-    matrix[..., -1, -1] -= margin * size[..., -1, -1]
-    return signs(matrix, size, rounding)[0] >= 0
-
-
-def _lifted(terms: tuple[Array, ...]) -> Array:
-    """[[H, b], [bᵀ, 2c]]."""
-    c, b, hessian = terms
-    H = block(hessian, None)
-    n = H.shape[-1]
-    b = b.reshape(*b.shape[:-2], n)
-    matrix = np.empty((*np.broadcast_shapes(c.shape, b.shape[:-1], H.shape[:-2]), n + 1, n + 1))
-    matrix[..., :n, :n], matrix[..., :n, n], matrix[..., n, :n], matrix[..., n, n] = H, b, b, 2 * c
-    return matrix
-
-
-def constant(value: Any) -> Node:
-    """A known constant; its first axis runs over the members."""
-    value = np.asarray(value)
-    if value.dtype.kind not in "biuf":
-        return opaque(value.shape[1:])
-    value = value.astype(np.float64)
-    return Node(value.shape[1:], 0, value, value, (value,), (np.abs(value),))
-
-
-def opaque(shape: tuple[int, ...]) -> Node:
-    """A constant of unknown value."""
-    return unknown(shape, 0)
-
-
-def unknown(shape: tuple[int, ...], degree: int | None = None) -> Node:
-    """A function of which nothing else is known."""
-    infinite = np.full((1,) * (len(shape) + 1), np.inf)
-    return Node(shape, degree, -infinite, infinite)
-
-
-def position(slot: int, arity: int, dimension: int) -> Node:
-    """The position in one of the slots of ψ."""
-    gradient = np.zeros((1, dimension, arity, dimension))
-    gradient[0, :, slot, :] = np.eye(dimension)
-    return replace(unknown((dimension,), 1), terms=(np.zeros((1, dimension)), gradient), sizes=(np.zeros((1, dimension)), gradient))
-
-
-# ------------------------------------------------------------------------------------------------------------ the operators
+from consat.constraints.atoms import ATOMS, Atom, powers
+from consat.constraints.node import ROUNDING, Array, Bend, Node, constant, opaque, unknown
 
 
 def arranged(nodes: Sequence[Node], index: Array) -> Node:
@@ -355,99 +197,6 @@ def dot(a: Node, b: Node, dimension_numbers: Any) -> Node:
     return fold(plus, times(one, two), [left.ndim - 1])
 
 
-# ---------------------------------------------------------------------------------------------------- functions of one number
-
-
-class Facts(NamedTuple):
-    """A function h of one real number, on an interval.
-
-    Attributes:
-        convex: bool.
-        concave: bool.
-        rising: bool; if h is defined on part of the line only, then also once extended by +∞ if convex and −∞ if concave.
-        falling: bool; likewise.
-        low: least value.
-        high: largest value.
-    """
-
-    convex: Any
-    concave: Any
-    rising: Any
-    falling: Any
-    low: Array
-    high: Array
-
-
-Atom = Callable[[Array, Array], Facts]
-
-
-def _rising(h: Callable[[Array], Array], convex: str, domain: float = -np.inf) -> Atom:
-    """A rising function that is convex: always, never, from 0 up, or up to 0; elsewhere it is concave."""
-
-    def facts(low: Array, high: Array) -> Facts:
-        holds = {"always": (True, False), "never": (False, True), "from 0": (low >= 0, high <= 0), "to 0": (high <= 0, low >= 0)}
-        return Facts(*holds[convex], True, False, np.where(high < domain, np.nan, h(np.maximum(low, domain))), h(high))
-
-    return facts
-
-
-def _even(h: Callable[[Array], Array]) -> Atom:
-    """A convex function of the absolute value."""
-
-    def facts(low: Array, high: Array) -> Facts:
-        ends = h(low), h(high)
-        return Facts(
-            True, False, low >= 0, high <= 0, np.where((low < 0) & (high > 0), h(np.zeros(())), np.minimum(*ends)), np.maximum(*ends)
-        )
-
-    return facts
-
-
-def _wave(h: Callable[[Array], Array]) -> Atom:
-    return lambda low, high: Facts(False, False, False, False, *(np.where(low == high, h(low), end) for end in (-1.0, 1.0)))
-
-
-ATOMS: Final[Mapping[str, Atom]] = {
-    "exp": _rising(np.exp, "always"),
-    "exp2": _rising(np.exp2, "always"),
-    "expm1": _rising(np.expm1, "always"),
-    "log": _rising(np.log, "never", 0.0),
-    "log1p": _rising(np.log1p, "never", -1.0),
-    "sqrt": _rising(np.sqrt, "never", 0.0),
-    "cbrt": _rising(np.cbrt, "to 0"),
-    "logistic": _rising(lambda x: 1 / (1 + np.exp(-x)), "to 0"),
-    "tanh": _rising(np.tanh, "to 0"),
-    "atan": _rising(np.arctan, "to 0"),
-    "asinh": _rising(np.arcsinh, "to 0"),
-    "sinh": _rising(np.sinh, "from 0"),
-    "cosh": _even(np.cosh),
-    "abs": _even(np.abs),
-    "sin": _wave(np.sin),
-    "cos": _wave(np.cos),
-}
-
-
-def _power(p: Array) -> Atom:
-    """x^p; with p no integer it is defined for x ≥ 0 only."""
-
-    def facts(low: Array, high: Array) -> Facts:
-        even, odd = p % 2 == 0, p % 2 == 1
-        whole = even | odd
-        positive, negative = low >= 0, high <= 0
-        convex = np.where(p >= 0, np.where(whole, even | positive, p > 1), np.where(whole, positive | (even & negative), True))
-        concave = np.where(p >= 0, np.where(whole, (odd & negative) | (p == 0), p < 1), odd & negative)
-        rising = np.where(p >= 0, np.where(whole, odd | positive, (p < 1) | positive), even & negative)
-        falling = np.where(p >= 0, even & negative, np.where(even, positive, np.where(odd, positive | negative, True)))
-        start, end = (np.where(whole, side, np.maximum(side, 0)) + 0.0 for side in (low, high))  # + 0.0 makes 0 of −0
-        ends = start**p, end**p
-        spans_zero, least, most = (start < 0) & (end > 0), np.minimum(*ends), np.maximum(*ends)
-        least = np.where(even & (p > 0) & spans_zero, 0, np.where((p < 0) & ~(start >= 0), np.where(even, 0, -np.inf), least))
-        most = np.where((p < 0) & ~(start >= 0), np.where(odd & negative, 0, np.inf), most)
-        return Facts(convex, concave, rising, falling, least, most)
-
-    return facts
-
-
 def atom(name: str, a: Node) -> Node:
     """A function of one number from `ATOMS`."""
     low, high = a.bounds
@@ -486,8 +235,8 @@ def _composed(facts: Atom, a: Node) -> Node:
 def _cone(q: Node, bend: Bend) -> Bend:
     """√q for a quadratic q: convex iff q ≥ 0 everywhere, so that q = ‖affine‖² + constant; if the constant is positive, then strictly so
     wherever q is. Sums of squares show it by their bounds; for others the constant 0 must be recognised in spite of rounding."""
-    cone = (q.low >= 0) | _nonnegative(q, 0.0, 4e-15)
-    smooth = _nonnegative(q, 1e-6) & (q.sizes[0] > 0)
+    cone = (q.low >= 0) | q.nonnegative(0.0, 4e-15)
+    smooth = q.nonnegative(1e-6) & (q.sizes[0] > 0)
     kind = np.arange(q.bend.strict.shape[-1]) < q.bend.strict.shape[-1] - 1
     strict = q.bend.strict & (smooth[..., None] | ~kind)
     return bend._replace(convex=bend.convex | cone, strict=np.where(cone[..., None], strict, bend.strict))
@@ -505,7 +254,7 @@ def power(a: Node, p: Array) -> Node:
         return square(a)
     if np.all(p == 0.5):
         return atom("sqrt", a)
-    node = _composed(_power(p), a)
+    node = _composed(powers(p), a)
     curved, bend = (p != 0) & (p != 1), node.bend
     return replace(node, rule=bend._replace(strict=bend.strict & curved[..., None], logconvex=a.bend.logconvex & (p > 0)))
 
@@ -514,7 +263,7 @@ def square(a: Node) -> Node:
     """a², of a function that varies: a quadratic if a is affine or the root of one."""
     if a.made[0] == "sqrt" and np.all(a.made[1][0].bounds[0] >= 0):
         return a.made[1][0]
-    node = _composed(_power(np.array(2.0)), a)
+    node = _composed(powers(np.array(2.0)), a)
     if a.degree != 1:
         return node
     return replace(node, degree=2, terms=a.terms and _product(a.terms, a.terms), sizes=a.sizes and _product(a.sizes, a.sizes))

@@ -32,7 +32,8 @@ import numpy as np
 from jax.extend import core
 from numpy.typing import ArrayLike, NDArray
 
-from consat.constraints.composition import Node, arranged, block, constant, highest, opaque, position, signs
+from consat.constraints.composition import arranged, highest
+from consat.constraints.node import Node, block, constant, opaque, position, signs
 from consat.constraints.tracing import CALLS, describe, evaluate, interpret
 from consat.numerics import once, stacked
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -66,3 +66,12 @@ class Constraint:
     name: str | None = None
     weight: float = 1.0
     source: str | None = None
+
+
+def flatten(item: Any) -> Iterator[Any]:
+    """The constraints of a list that may nest."""
+    if isinstance(item, list | tuple):
+        for part in item:
+            yield from flatten(part)
+    else:
+        yield item

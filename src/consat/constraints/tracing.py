@@ -16,24 +16,9 @@ import numpy as np
 from jax.extend import core
 from numpy.typing import NDArray
 
-from consat.constraints.composition import (
-    ATOMS,
-    Node,
-    arranged,
-    atom,
-    constant,
-    dot,
-    fold,
-    larger,
-    minus,
-    negative,
-    plus,
-    power,
-    raised,
-    smaller,
-    times,
-    unknown,
-)
+from consat.constraints.atoms import ATOMS
+from consat.constraints.composition import arranged, atom, dot, fold, larger, minus, negative, plus, power, raised, smaller, times
+from consat.constraints.node import Node, constant, unknown
 
 Array = NDArray[Any]
 T = TypeVar("T")

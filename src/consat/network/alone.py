@@ -14,6 +14,7 @@ from consat.network.part import Part
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.scale import Region
+from consat.solver import LocalSolver
 
 PRECISION = prox.Precision(tolerance=1e-9)
 """Of the local step; as in `consat.simulate.kernel` for small teams."""
@@ -61,78 +62,38 @@ class OwnLinks:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Alone:
-    """`consat.protocols.Solver` of one agent; what is one number an agent has shape (1,).
+class Alone(LocalSolver):
+    """One agent.
 
     Attributes:
         links: its ends of its links.
-        length: the team's unit of length.
-        region: where the team's places are.
-        plan: of its own local step, if it has constraints.
-        nu: the smoothing.
-        local: its objective over the positions it holds.
-        talkers: all ends in one group.
         me: its own row.
-        rows: how many positions it holds.
-        hops: see `Part`.
-        convex: see `Part`.
     """
 
     links: OwnLinks
-    length: Array
-    region: Region
-    plan: prox.Plan
-    nu: Nu
-    local: Objective
-    talkers: Groups
     me: int = field(metadata={"static": True})
-    rows: int = field(metadata={"static": True})
-    hops: int = field(metadata={"static": True})
-    convex: bool = field(metadata={"static": True})
 
     @classmethod
     def of(cls, part: Part) -> Alone:
-        """The solver of a part; its rows are in the order of `part.team.ids`."""
+        """The solver of a part; its rows are in the order of `part.team.ids`, and it is agent 0 of one."""
         team = part.team
         me = team.ids.index(part.me)
         plan = prox.buckets(team, lambda _, position: position, team.count, part.convex)
+        batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
         return cls(
             links=OwnLinks.of(part),
             length=jnp.asarray(part.length),
             region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
-            plan=prox.Plan(
-                tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches), plan.row, plan.agent[me : me + 1], 1
-            ),
+            plan=prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1),
             nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
-            local=Objective.at_positions(team),
+            local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
+            holder=jnp.zeros(team.count, dtype=np.int32),
             talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
-            me=me,
-            rows=team.count,
             hops=part.hops,
             convex=part.convex,
+            precision=PRECISION,
+            me=me,
         )
-
-    def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        return prox.recall(self.plan, self.nu, x, kappa)
-
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, prox.Memory, Array]:
-        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.plan, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), precision=PRECISION)
-
-    def nearby(self, x: Array) -> Array:
-        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
-        return jnp.where(idle[:, None], x, self.region.nearby(x))
-
-    def margin(self, x: Array) -> Array:
-        return self.local.agent_margins(x)[self.me : self.me + 1]
-
-    def to_rows(self, numbers: Array) -> Array:
-        return jnp.broadcast_to(numbers, (self.rows,))
-
-    def least(self, numbers: Array) -> Array:
-        return -self.talkers.max(-numbers)
 
 
 def ends(part: Part) -> list[tuple[str, str]]:

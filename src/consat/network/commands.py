@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,19 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from consat.network.environment import prepare_own
+from consat.terminal import DONE, estimates_option, full_option, json_option, located, out_option, scenario_argument, set_option, tell
 
 if TYPE_CHECKING:
     from consat.network.part import Part
 
-DONE, FAILED, UNSATISFIED, INTERRUPTED = 0, 1, 4, 130
 MODES = ["lockstep", "link", "admm"]
 
-scenario_argument = click.argument("scenario", metavar="FILE")
-set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
 protocol_option = click.option("--protocol", metavar="KIND", help="For --mode lockstep: admm (default), proximal, max-min.")
-estimates_option = click.option(
-    "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."
-)
 port_option = click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Of the first agent.")
 mode_option = click.option("--mode", type=click.Choice(MODES), default="admm", show_default=True, help="How they talk.")
 rate_option = click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Turns a second.")
@@ -104,7 +98,7 @@ def split(
     pairs = [address.partition("=") for address in addresses]
     if bad := [agent for agent, equals, _ in pairs if not equals]:
         raise click.UsageError(f"--address {bad[0]!r} must be ID=ADDRESS, such as a2=tcp/192.168.0.7:7447")
-    with _located(loaded):
+    with located(loaded):
         parts = split_scenario(loaded, run=run, addresses={agent: to for agent, _, to in pairs}, port=port, absent=absent)
         texts = {agent: write_part(part) for agent, part in parts.items()}
     out.mkdir(parents=True, exist_ok=True)
@@ -174,10 +168,10 @@ def agent(
 @until_option
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; after convergence if nothing is said.")
 @keys_option
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there.")
-@click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
+@out_option
+@full_option
 @click.option("--quiet", is_flag=True, help="No table and no summary.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
+@json_option
 def launch(
     *, scenario: str, overrides: tuple[str, ...], protocol: str | None, estimates: str | None, seed: int | None, keys: Path | None,
     out: Path | None, full: bool, quiet: bool, as_json: bool, **plan: Any,
@@ -189,19 +183,13 @@ def launch(
     from consat.scenario import load
 
     loaded = _with(load(scenario, overrides), protocol, estimates, seed)
-    with _located(loaded):
+    with located(loaded):
         result = launch_team(loaded, Plan(**plan, keys=_keys(keys, scenario, loaded.team.ids)), quiet=quiet or as_json, full=full)
     if out is not None:
         result.summary["result"] = str(out / "result.nc")
         result.save(out / "result.nc")
         result.plot(out)
-    if as_json:
-        click.echo(json.dumps(result.summary))
-    elif not quiet:
-        click.echo(str(result))
-    if result.summary["ending"] == "interrupted":
-        return INTERRUPTED
-    return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+    return tell(result, quiet=quiet, as_json=as_json)
 
 
 def _with(scenario: Any, protocol: str | None, estimates: str | None, seed: int | None) -> Any:
@@ -217,23 +205,6 @@ def _with(scenario: Any, protocol: str | None, estimates: str | None, seed: int 
         }
     )
     return dataclasses.replace(scenario, settings=settings)
-
-
-def _located(scenario: Any) -> Any:
-    """Faults that show only later get their place in the file."""
-    from contextlib import contextmanager
-
-    from consat.errors import InvalidInput
-    from consat.scenario import located
-
-    @contextmanager
-    def guard() -> Any:
-        try:
-            yield
-        except InvalidInput as error:
-            raise located(error, scenario) from None
-
-    return guard()
 
 
 def _part(file: str, agent: str, overrides: tuple[str, ...], port: int) -> Part:
@@ -253,7 +224,7 @@ def _part(file: str, agent: str, overrides: tuple[str, ...], port: int) -> Part:
     loaded = load(file, overrides)
     if agent not in loaded.team.ids:
         raise InvalidSettings(f"there is no agent {agent!r}{closest(agent, loaded.team.ids)}")
-    with _located(loaded):
+    with located(loaded):
         return split(loaded, port=port, only=agent)[agent]
 
 

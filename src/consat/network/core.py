@@ -196,7 +196,7 @@ class _Layout(NamedTuple):
     @classmethod
     def of(cls, protocol: Rounds, solver: Alone, dimension: int) -> _Layout:
         """Found by tracing, not by running."""
-        first, outline = jax.ShapeDtypeStruct((solver.rows, dimension), float), _Outline(solver)
+        first, outline = jax.ShapeDtypeStruct((len(solver.holder), dimension), float), _Outline(solver)
 
         def message(x: Array) -> Any:
             return protocol.speak(protocol.start(x, outline), outline, jnp.asarray(0.0), jnp.zeros(1))[1]

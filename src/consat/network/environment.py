@@ -24,10 +24,7 @@ def prepare(environment: MutableMapping[str, str], *, exact: bool) -> None:
     for name in _THREADS:
         environment.setdefault(name, "1")
     environment.setdefault("JAX_PLATFORMS", "cpu")
-    home = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "consat" / "xla"))
-    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    keep_compilations(environment)
     flags = environment.get("XLA_FLAGS", "")
     for flag in (ONE_THREAD, *([ROUND_EACH] if exact and platform.machine() in ("x86_64", "AMD64") else [])):
         if flag.partition("=")[0] not in flags:
@@ -38,3 +35,12 @@ def prepare(environment: MutableMapping[str, str], *, exact: bool) -> None:
 def prepare_own(*, exact: bool) -> None:
     """The same for this process."""
     prepare(os.environ, exact=exact)
+
+
+def keep_compilations(environment: MutableMapping[str, str]) -> None:
+    """Keep compiled programs between runs, in the user's own cache directory, unless somebody has said where."""
+    if "JAX_COMPILATION_CACHE_DIR" not in environment:
+        home = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        environment["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
+    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

@@ -146,7 +146,7 @@ def _hear(solver: Alone, state: LinkState, inbox: Array, arrived: Array) -> Link
     fresh = (arrived & told & (state.adopted <= 0)).astype(age.dtype)
     count = solver.links.sum(fresh)
     taken = solver.links.sum(fresh[:, None] * there) / jnp.maximum(count, 1.0)[:, None]
-    others = jnp.arange(solver.rows) != solver.me
+    others = jnp.arange(len(state.x)) != solver.me
     return state._replace(
         x=jnp.where(((count > 0) & others)[:, None], taken, state.x),
         force=force,

@@ -19,8 +19,9 @@ from jax import Array
 
 from consat.numerics import float64, quick_compilation
 from consat.protocols import Rounds
+from consat.simulate.engine import CHUNK, NEVER, Ask, Chosen, Chunk, advance, start
 from consat.simulate.kernel import Now, World
-from consat.simulate.rounds import CHUNK, HOLD, NEVER, Ask, Chosen, Chunk, Rules, Tally, advance, start
+from consat.simulate.rounds import HOLD, Rules, Tally
 from consat.trace import Ending
 
 LANES = 32

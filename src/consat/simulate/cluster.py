@@ -20,10 +20,10 @@ from consat.numerics import quick_compilation
 from consat.objective import Nu
 from consat.protocols import Rounds
 from consat.scale import Scale
+from consat.simulate.engine import CHUNK, Chunk, Kept
 from consat.simulate.kernel import Body, Now, Part, Spoken, Weather, World, begin, hear, precision_for, speak, world_of
 from consat.simulate.partition import Halo, Share, assign
 from consat.simulate.recording import Choice
-from consat.simulate.rounds import CHUNK, HOLD, Chunk, Kept
 from consat.team import Team
 
 PATIENCE = 600
@@ -73,12 +73,12 @@ class ManyProcesses:
         weather: loss and sleep.
         body: how fast positions follow estimates.
         choice: what is recorded.
-        hold: whether satisfied rounds on end are the end.
+        hold: how many satisfied rounds on end are the end; None if nothing of the kind is.
     """
 
     def __init__(
         self, team: Team, protocol: Rounds, copies: Estimates, nu: Nu, size: Scale, first: np.ndarray, *, convex: bool, weather: Weather,
-        body: Body | None, choice: Choice, hold: bool,
+        body: Body | None, choice: Choice, hold: int | None,
     ) -> None:  # fmt: skip
         self._count, self._me = jax.process_count(), jax.process_index()
         if team.count < self._count:
@@ -139,10 +139,10 @@ class ManyProcesses:
             now, book = run.hear(self._protocol, self.world, now, spoken, (into, self._messages.into), noted)
         numbers = np.arange(number + 1, number + 1 + count)
         chunk = self._seen(book, state.now.body, np.flatnonzero(numbers % every == 0), count)
-        if self._hold:
+        if self._hold is not None:
             for k, margin in enumerate(chunk.margin[:count]):
                 streak = streak + 1 if margin > 0 else 0
-                if streak >= HOLD and k + 1 < count:  # it ended within the chunk: go there again
+                if streak >= self._hold and k + 1 < count:  # it ended within the chunk: go there again
                     return self.advance(state, number, k + 1, streak - k - 1, every)
         return _State(now, number + count), chunk
 

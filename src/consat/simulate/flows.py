@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ import numpy as np
 from jax import Array
 
 from consat.estimates import Estimates, Exchange
-from consat.numerics import CompileClock, float64, quick_compilation
+from consat.numerics import float64, quick_compilation
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import Flow, State
 from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
-from consat.simulate.interruption import heeded
-from consat.simulate.recording import Choice, Memory, Rows, Sink, told
+from consat.simulate.loop import Steps, follow
+from consat.simulate.recording import Choice, Memory, Rows, Sink
 from consat.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
@@ -90,43 +90,32 @@ class Observer:
         objective: over true positions.
         own: (N,) rows of own positions.
         agents: (R,) who is recorded, or None for all in order.
-        copies: (E,) rows recorded, none where estimates are not.
+        copies: (E,) rows recorded, or None where estimates are not.
     """
 
     objective: Objective
     own: Array
     agents: Array | None
-    copies: Array
+    copies: Array | None
 
     @classmethod
     def of(cls, team: Team, estimates: Estimates, choice: Choice) -> Observer:
         agents = None if choice.everyone else jnp.asarray(choice.agents)
-        copies = np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)
-        return cls(Objective.at_positions(team), jnp.asarray(estimates.own), agents, jnp.asarray(copies))
+        copies = None if choice.copies is None else jnp.asarray(choice.copies.astype(np.int32))
+        return cls(Objective.at_positions(team), jnp.asarray(estimates.own), agents, copies)
 
-    def look(self, flow: Flow, problem: Problem, time: Array, state: State) -> Observed:
-        """What is seen at a time."""
+    def look(self, flow: Flow, problem: Problem, time: Array, state: State) -> Rows:
+        """The record of a time."""
         position = state.x[self.own]
         margins = self.objective.agent_margins(position)
         smooth = self.objective.smooth_margin(position, problem.schedule.at(time))
         velocity = rate(flow, problem, time, state).x[self.own]
-        if self.agents is not None:
-            position, velocity, of_agents = (values[self.agents] for values in (position, velocity, margins))
-        else:
-            of_agents = margins
-        return Observed(position, velocity, jnp.min(margins), smooth, of_agents, state.x[self.copies], state.z[self.copies])
-
-
-class Observed(NamedTuple):
-    """What is seen of a moment, or with a leading axis of several: of recorded agents and copies, and of the whole team."""
-
-    position: Any
-    velocity: Any
-    margin: Any
-    smooth_margin: Any
-    agent_margin: Any
-    estimate: Any
-    integral: Any
+        of_agents = (
+            (position, velocity, margins) if self.agents is None else (values[self.agents] for values in (position, velocity, margins))
+        )
+        position, velocity, agent_margin = of_agents
+        of_copies = (None, None) if self.copies is None else (state.x[self.copies], state.z[self.copies])
+        return Rows(time, position, velocity, jnp.min(margins), smooth, agent_margin, *of_copies)
 
 
 def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> State:
@@ -136,8 +125,8 @@ def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> Sta
 
 
 @functools.cache
-def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
-    """The compiled integration, from ``times[0]``: what is seen at ``times[1:]``, the state at the last of them, whether all went well, and
+def _advance() -> Callable[..., tuple[Rows, State, Array, Array]]:
+    """The compiled integration, from ``times[0]``: the record of ``times[1:]``, the state at the last of them, whether all went well, and
     how far any position was from where it was at the start."""
     import diffrax
     import optimistix
@@ -148,10 +137,10 @@ def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
         # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
         return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
 
-    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> tuple[Observed, State, Array, Array]:
+    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> tuple[Rows, State, Array, Array]:
         anchor = state.x[observer.own]
 
-        def look(t: Array, y: State, _: Any) -> tuple[Observed, Array]:
+        def look(t: Array, y: State, _: Any) -> tuple[Rows, Array]:
             moved = jnp.max(jnp.abs(y.x[observer.own] - anchor), initial=0.0)
             return observer.look(flow, problem, jnp.asarray(t), y), moved
 
@@ -176,7 +165,7 @@ def _advance() -> Callable[..., tuple[Observed, State, Array, Array]]:
 
 
 @functools.partial(jax.jit, static_argnames=("flow",))
-def _first_look(flow: Flow, problem: Problem, observer: Observer, time: Array, state: State) -> Observed:
+def _look(flow: Flow, problem: Problem, observer: Observer, time: Array, state: State) -> Rows:
     return jax.tree.map(lambda leaf: leaf[None], observer.look(flow, problem, time, state))
 
 
@@ -215,127 +204,105 @@ def simulate_flow(
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     choice = choice or Choice.of(team, estimates, estimates=record)
-    sink = sink or Memory(choice.every)
     end = PATIENCE if until is None else until
     grid = np.linspace(0.0, end, max(round(end / SAMPLE), 1) + 1)
     problem, observer = Problem.of(team, estimates, schedule), Observer.of(team, estimates, choice)
-    state, tally = flow.start(jnp.asarray(first)), _Tally(every=choice.every)
     known = "" if checkpoint is None else fingerprint(team, flow, schedule, first, estimates.layout, float(grid[1]))
-    ending: Ending = "out of time"
-    with CompileClock() as clock, heeded() as stopped:
-        taken = None if checkpoint is None else checkpoint.restore(state, known)
-        if taken is None:
-            tally.add(sink, choice, grid[:1], _first_look(flow, problem, observer, jnp.asarray(0.0), state))
-        else:
-            state, tally = taken[0], _Tally(**taken[1])
-            sink.every = tally.every
-
-        def save() -> None:
-            if checkpoint is not None:
-                sink.flush()
-                checkpoint.write(state, tally.__dict__, known)
-
-        while tally.done < len(grid) - 1:
-            times = grid[tally.done : tally.done + CHUNK + 1]
-            padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
-            seen, state, fine, moved = _advance()(flow, problem, observer, state, jnp.asarray(padded))
-            tally.add(sink, choice, times[1:], seen, float(moved))
-            heard = told(progress, times[-1] / end, tally.margin)
-            if not fine:
-                found: Ending | None = "too stiff" if np.isfinite(tally.drift) else "diverged"
-                state = state if found == "too stiff" else jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state)
-            else:
-                found = _ending(tally, stop, schedule, state.x[observer.own], infeasible)
-            if found is None and (stopped() or not heard):
-                found = "interrupted"
-            if found is not None:
-                ending = found
-                break
-            if checkpoint is not None and checkpoint.due():
-                save()
-        save()
-    if tally.done % sink.every:  # the last sample is always recorded
-        seen = _first_look(flow, problem, observer, jnp.asarray(tally.time), state)
-        _append(sink, choice, np.array([tally.time]), jax.tree.map(np.asarray, seen))
-    rows = sink.close()
-    return Trace(
-        clock="time",
-        steps=rows.step,
-        position=rows.position,
-        velocity=rows.velocity,
-        margin=rows.margin,
-        smooth_margin=rows.smooth_margin,
-        agent_margin=rows.agent_margin,
-        estimate=rows.estimate,
-        integral=rows.integral,
-        holder=estimates.holder if choice.copies is None else estimates.holder[choice.copies],
-        held=estimates.position if choice.copies is None else estimates.position[choice.copies],
-        cluster=estimates.cluster,
-        ending=ending,
-        satisfied_from=tally.satisfied_from,
-        messages=None,
-        floats_sent=None,
-        known_from=None,
-        seconds=clock.seconds,
-        recorded=None if choice.everyone else choice.agents,
-        final=np.array(state.x[observer.own]),
-        drift=tally.drift,
-        file=sink.path,
-    )
+    course = _Course(flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
+    return follow(course, estimates, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=known, progress=progress)
 
 
 @dataclass
-class _Tally:
-    """What is counted as time goes by; plain numbers, which a checkpoint holds.
+class _Tally(Steps):
+    """What is counted of a flow.
 
     Attributes:
-        done: samples after the first.
-        time: of the last, s.
-        margin: the last.
+        time: of the last sample, s.
         satisfied_from: the time after the last at which the margin was ≤ 0, interpolated; None if the last margin is.
         good: for how many samples on end the margin has been positive.
-        drift: of the last chunk.
-        recorded: steps in the record.
-        every: each how manieth sample is recorded.
     """
 
-    done: int = -1
     time: float = 0.0
-    margin: float = np.nan
     satisfied_from: float | None = None
     good: int = 0
-    drift: float = np.inf
-    recorded: int = 0
-    every: int = 1
 
-    def add(self, sink: Sink, choice: Choice, times: np.ndarray, seen: Observed, moved: float = np.inf) -> None:
-        """Count some samples, and keep of them what is wanted."""
-        count, first = len(times), self.done < 0
-        seen = Observed(*(np.asarray(leaf)[:count] for leaf in seen))
-        margin, at = (seen.margin, times) if first else (np.append(self.margin, seen.margin), np.append(self.time, times))
-        bad = np.flatnonzero(~(seen.margin > 0))
+    def add(self, rows: Rows, moved: float = np.inf) -> None:
+        """Count some samples."""
+        count, first = len(rows.step), self.done < 0
+        at, margin = (rows.step, rows.margin) if first else (np.append(self.time, rows.step), np.append(self.margin, rows.margin))
+        bad = np.flatnonzero(~(rows.margin > 0))
         self.good = count - 1 - int(bad[-1]) if len(bad) else self.good + count
         if first or len(bad) or (self.satisfied_from is None):
             self.satisfied_from = satisfied_from(at, margin, interpolate=True)
-        chosen = np.flatnonzero(np.arange(self.done + 1, self.done + 1 + count) % sink.every == 0)
         self.done += count
-        self.time, self.margin, self.drift = float(times[-1]), float(seen.margin[-1]), moved
-        _append(sink, choice, times[chosen], Observed(*(leaf[chosen] for leaf in seen)))
-        self.recorded += len(chosen)
-        self.every = sink.every
+        self.time, self.margin, self.drift = float(rows.step[-1]), float(rows.margin[-1]), moved
 
 
-def _append(sink: Sink, choice: Choice, times: np.ndarray, seen: Observed) -> None:
-    estimate, integral = (None, None) if choice.copies is None else (seen.estimate, seen.integral)
-    sink.append(Rows(times, seen.position, seen.velocity, seen.margin, seen.smooth_margin, seen.agent_margin, estimate, integral))
+@dataclass
+class _Course:
+    """A flow, for `consat.simulate.loop`; `grid` are the times of all samples, the rest is as in `simulate_flow`."""
 
+    flow: Flow
+    problem: Problem
+    observer: Observer
+    first: np.ndarray
+    grid: np.ndarray
+    stop: Stop
+    infeasible: Callable[[np.ndarray], bool]
+    tally: _Tally
 
-def _ending(tally: _Tally, stop: Stop, schedule: Schedule, positions: Array, infeasible: Callable[[np.ndarray], bool]) -> Ending | None:
-    """Why the run should end now, or None."""
-    if stop == "satisfied" and tally.good > HOLD / SAMPLE:
-        return "satisfied"
-    if stop == "never" or tally.time < schedule.duration + HOLD:
-        return None
-    at = np.asarray(positions)
-    settled = tally.drift <= SETTLED * max(float(np.abs(at).max(initial=0.0)), 1e-300)
-    return "settled" if settled and (stop == "converged" or infeasible(at)) else None
+    def __post_init__(self) -> None:
+        self.end = len(self.grid) - 1
+
+    def start(self) -> tuple[State, Rows]:
+        state = self.flow.start(jnp.asarray(self.first))
+        rows = self.look(state)
+        self.tally.add(rows)
+        return state, rows
+
+    def advance(self, state: State, every: int) -> tuple[State, Rows, Ending | None]:
+        done = self.tally.done
+        times = self.grid[done : done + CHUNK + 1]
+        padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
+        seen, state, fine, moved = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
+        count = len(times) - 1
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], seen)._replace(step=times[1:])
+        self.tally.add(rows, float(moved))
+        rows = rows.where(np.arange(done + 1, done + 1 + count) % every == 0)
+        if fine:
+            return state, rows, self._ending(state)
+        if np.isfinite(self.tally.drift):
+            return state, rows, "too stiff"
+        return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state), rows, "diverged"
+
+    def _ending(self, state: State) -> Ending | None:
+        """Why the run should end now, or None."""
+        tally = self.tally
+        if self.stop == "satisfied" and tally.good > HOLD / SAMPLE:
+            return "satisfied"
+        if self.stop == "never" or tally.time < self.problem.schedule.duration + HOLD:
+            return None
+        at = self.positions(state)
+        settled = tally.drift <= SETTLED * max(float(np.abs(at).max(initial=0.0)), 1e-300)
+        return "settled" if settled and (self.stop == "converged" or self.infeasible(at)) else None
+
+    def agree(self, stop: bool) -> bool:
+        return stop
+
+    def look(self, state: State) -> Rows:
+        rows = _look(self.flow, self.problem, self.observer, jnp.asarray(self.tally.time), state)
+        return jax.tree.map(np.asarray, rows)
+
+    def positions(self, state: State) -> np.ndarray:
+        return np.array(state.x[self.observer.own])
+
+    def told(self, rows: Rows) -> Mapping[str, Any]:
+        return {
+            "clock": "time",
+            "velocity": rows.velocity,
+            "satisfied_from": self.tally.satisfied_from,
+            "messages": None,
+            "floats_sent": None,
+            "known_from": None,
+            "drift": self.tally.drift,
+        }

@@ -19,6 +19,7 @@ from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
 from consat.scale import Region, Scale
+from consat.solver import LocalSolver
 from consat.team import Team
 
 EXACT = prox.Precision(tolerance=1e-9)
@@ -84,58 +85,16 @@ class Ends:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Everyone:
-    """`consat.protocols.Solver`, for all agents at once.
+class Everyone(LocalSolver):
+    """All agents at once.
 
     Attributes:
         links: all ends.
-        length: the team's unit of length.
-        region: where the team's places are.
-        plan: the agents by shape, for their local steps.
-        precision: of these.
-        nu: the smoothing.
-        local: every agent's objective over its copies.
-        holder: (C,) who holds each copy.
-        talkers: groups the ends by agent.
         agents: N.
-        hops: see `consat.graphs.hops`.
-        convex: whether every ψ is known to be concave.
     """
 
     links: Ends
-    length: Array
-    region: Region
-    plan: prox.Plan
-    nu: Nu
-    local: Objective
-    holder: Array
-    talkers: Groups
     agents: int = field(metadata={"static": True})
-    hops: int = field(metadata={"static": True})
-    convex: bool = field(metadata={"static": True})
-    precision: prox.Precision = field(metadata={"static": True})
-
-    def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        return prox.recall(self.plan, self.nu, x, kappa)
-
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, prox.Memory, Array]:
-        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.plan, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), precision=self.precision)
-
-    def nearby(self, x: Array) -> Array:
-        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
-        return jnp.where(idle[:, None], x, self.region.nearby(x))
-
-    def margin(self, x: Array) -> Array:
-        return self.local.agent_margins(x)
-
-    def to_rows(self, numbers: Array) -> Array:
-        return numbers[self.holder]
-
-    def least(self, numbers: Array) -> Array:
-        return -self.talkers.max(-numbers)
 
 
 @dataclass(frozen=True)

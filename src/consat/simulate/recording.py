@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, Protocol
@@ -264,12 +264,3 @@ def velocities(step: np.ndarray, position: np.ndarray, period: float) -> np.ndar
     """
     gap = np.diff(step, append=step[-1:] + 1) * period
     return np.asarray(np.diff(position, axis=0, append=position[-1:]) / gap[:, None, None])
-
-
-def told(progress: Callable[[float, float], None], done: float, margin: float) -> bool:
-    """Whether whoever watches lets the run go on."""
-    try:
-        progress(done, margin)
-    except KeyboardInterrupt:
-        return False
-    return True

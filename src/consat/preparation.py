@@ -1,0 +1,142 @@
+"""From what is given to a team that is ready to run: its scenario, the settings that hold, the layout of copies and first estimates."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consat.certificate import bounds
+from consat.errors import InvalidInput, InvalidSettings
+from consat.estimates import Estimates
+from consat.objective import Schedule
+from consat.protocols import FLOWS, ROUNDS
+from consat.quadratics import shape_of
+from consat.scale import Scale, automatic, scale, start_box
+from consat.scenario import Scenario, dump, load
+from consat.settings import Settings, Start
+from consat.team import Team
+
+DEFAULT_PROTOCOL = "admm"
+SHARP = 5e-4
+"""Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
+
+
+def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
+    """What `run` was given, as a scenario."""
+    if isinstance(team, Scenario):
+        return team
+    if not isinstance(team, Team):
+        return load(team)
+    try:
+        text = dump(team, Settings(), "team")
+    except InvalidInput:
+        text = ""
+    return Scenario(name="team", team=team, settings=Settings(), text=text, source="team")
+
+
+def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
+    """The scenario with the auxiliary constraint added to every agent."""
+    from consat import assumptions
+
+    return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
+
+
+def settings_of(asked: Settings, given: Mapping[str, Any]) -> Settings:
+    """What the scenario asks for, and `given` overrides.
+
+    Raises:
+        InvalidSettings: there is no such protocol.
+    """
+    start, seed = given["start"], given["seed"]
+    kind, estimates = given["protocol"] or asked.protocol.kind or DEFAULT_PROTOCOL, given["estimates"] or asked.protocol.estimates
+    settings = asked.model_copy(
+        update={
+            "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
+            "protocol": asked.protocol.model_copy(update={"kind": kind, "estimates": estimates}),
+            "smoothing": given["smoothing"] or asked.smoothing,
+        }
+    )
+    if kind not in FLOWS and kind not in ROUNDS:
+        raise InvalidSettings(f"there is no protocol {kind!r}; choose one of {', '.join((*ROUNDS, *FLOWS))}")
+    return settings
+
+
+class Prepared(NamedTuple):
+    """A team made ready to run.
+
+    Attributes:
+        team: the team.
+        copies: the layout of estimates.
+        schedule: of ν.
+        size: the team's natural size.
+        settings: what holds.
+    """
+
+    team: Team
+    copies: Estimates
+    schedule: Schedule
+    size: Scale
+    settings: Settings
+
+    @classmethod
+    def of(cls, team: Team, settings: Settings) -> Prepared:
+        """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
+        size = scale(team)
+        schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+        return cls(team, Estimates.of(team, settings.protocol.estimates), schedule, size, settings)
+
+    def first(self, start: Start | None = None) -> np.ndarray:
+        """(C, d) first estimates, drawn as the settings say, or otherwise."""
+        return first_estimates(self.team, self.copies, start or self.settings.start, self.size)
+
+    @property
+    def convex(self) -> bool:
+        """Whether every ψ is known to be concave."""
+        return bool(shape_of(self.team).concave.all())
+
+    def hopeless(self, position: np.ndarray) -> bool:
+        """Whether (N, d) positions prove that no formation satisfies every constraint."""
+        return bounds(self.team, position, self.schedule.final).verdict == "infeasible"
+
+    @property
+    def enough(self) -> Callable[[np.ndarray], bool] | None:
+        """Says of (N, d) positions whether no formation is better by more than a tolerance; None where nobody asks."""
+        return (lambda position: _gap(self.team, position) <= SHARP * self.size.psi) if self.settings.protocol.kind == "max-min" else None
+
+
+def _gap(team: Team, position: np.ndarray) -> float:
+    """How much better than this, at most, another formation could be."""
+    certificate = bounds(team, position)
+    return np.inf if certificate.upper is None else certificate.upper - certificate.lower
+
+
+def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) -> np.ndarray:
+    """(C, d) first estimates, drawn where nothing is given; the row of each agent's own position is its start (paper, section IV-E).
+
+    Raises:
+        InvalidSettings: the box has another dimension than the team.
+    """
+    d = team.dimension
+    if start.box is None:
+        low, high = start_box(size)
+    else:
+        low, high = (np.atleast_1d(np.asarray(side, dtype=float)) for side in start.box)
+        if len(low) not in (1, d):
+            raise InvalidSettings(
+                f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team"
+            )
+    random = np.random.default_rng(start.seed)
+    where = (team.count, d), (copies.count, d)
+    drawn, first = (random.uniform(low, high, shape) for shape in where)
+    if team.around is not None:  # what the box gives, moved into the box that each has of its own
+        place, reach = team.around
+        half = np.where(high > low, (high - low) / 2, 1.0)
+        for values, whose in ((drawn, slice(None)), (first, copies.position)):
+            near = place[whose] + reach[whose][:, None] * (values - (low + high) / 2) / half
+            values[...] = np.where(np.isnan(near), values, near)
+    first[copies.own] = np.where(np.isnan(team.starts), drawn, team.starts)
+    return first

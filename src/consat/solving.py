@@ -1,0 +1,63 @@
+"""`solve`: the best margin, found centrally."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from consat.certificate import BINDING, bounds
+from consat.numerics import float64
+from consat.preparation import scenario_of, with_auxiliary
+from consat.scenario import Scenario
+from consat.summary import number
+from consat.team import Team
+
+SCHEMA = "consat.solve/1"
+
+
+@float64
+def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> dict[str, Any]:
+    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.reference.max_min`.
+
+    Args:
+        team: as in `run`.
+        seed: of the starts, where there are many.
+        auxiliary: as in `run`.
+
+    Returns:
+        what ``consat solve --json`` prints (schema consat.solve/1), and ``reasons``: what binds or conflicts, in words.
+    """
+    from consat.reasons import explain
+    from consat.reference import max_min
+
+    scenario = scenario_of(team)
+    if auxiliary is not None:
+        scenario = with_auxiliary(scenario, auxiliary)
+    problem = scenario.team
+    optimum = max_min(problem, seed=seed)
+    certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
+    return {
+        "schema": SCHEMA,
+        "scenario": scenario.name,
+        "margin": number(optimum.margin),
+        "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
+        "verdict": certificate.verdict,
+        "positions": {agent: [number(x) for x in row] for agent, row in zip(problem.ids, optimum.positions, strict=True)},
+        "binding": [
+            {"agent": problem.ids[problem.owner[k]], "constraint": problem.names[k], "multiplier": float(optimum.multipliers[k])}
+            for k in np.argsort(-optimum.multipliers, kind="stable")
+            if optimum.multipliers[k] > BINDING
+        ],
+        "method": optimum.method,
+        "auxiliary": None if auxiliary is None else _auxiliary(problem, auxiliary, optimum.multipliers),
+        "reasons": explain(problem, optimum),
+    }
+
+
+def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
+    """Says that the auxiliary constraint was added, and on whom it binds: then the radius is too small."""
+    from consat.assumptions import binding_auxiliaries
+
+    return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}

@@ -1,0 +1,96 @@
+"""What is told of a run: how it ended, and its numbers, as JSON can hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from consat import __version__
+from consat.certificate import bounds
+from consat.objective import Objective, Schedule, weigh
+from consat.scale import Scale
+from consat.scenario import Scenario
+from consat.settings import Settings
+from consat.team import Team
+from consat.trace import Trace
+
+SCHEMA = "consat.run/1"
+MOST_LISTED = 10_000
+"""Above this many agents the summary leaves out what it says of each."""
+AT_REST = 1e-2
+"""A team whose last positions moved by less than this, in its units of length, counts as arrived."""
+
+
+def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
+    """What ``run --json`` prints (schema consat.run/1)."""
+    team, position = scenario.team, trace.end
+    nu = schedule.final
+    margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
+    margin = number(margins.min(initial=np.inf))
+    certificate = bounds(team, position, nu)
+    listed = full or team.count <= MOST_LISTED
+    period = 1.0 if trace.clock == "time" else trace.period
+    return {
+        "schema": SCHEMA,
+        "scenario": scenario.name,
+        "version": __version__,
+        "protocol": settings.protocol.kind,
+        "estimates": settings.protocol.estimates,
+        "seed": settings.start.seed,
+        "status": status_of(trace.ending, trace.moved_lately, margin, certificate.verdict, size.length),
+        "verdict": certificate.verdict,
+        "margin": margin,
+        "smooth_margin": number(trace.smooth_margin[-1]),
+        "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
+        "satisfied_from": {
+            "time": None if trace.satisfied_from is None or period is None else trace.satisfied_from * period,
+            "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
+        },
+        "known_from": trace.known_from,
+        "rounds": int(trace.steps[-1]) if trace.clock == "round" else None,
+        "time": float(trace.steps[-1]) if trace.clock == "time" else None,
+        "ending": trace.ending,
+        "messages": trace.messages,
+        "floats_sent": trace.floats_sent,
+        "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
+        "agents": _agents(team, margins, multipliers) if listed else None,
+        "clusters": _clusters(team, trace.cluster) if listed else None,
+        "count": team.count,
+        "result": None,
+        "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
+    }
+
+
+def status_of(ending: str, moved: float, margin: float | None, verdict: str, length: float) -> str:
+    """How a run ended, for people: `moved` is how far any agent moved lately, `length` the team's unit of length."""
+    if ending == "diverged":
+        return "diverged"
+    if margin is not None and margin > 0:
+        return "satisfied"
+    arrived = moved <= AT_REST * length
+    return "least-violating" if verdict == "infeasible" and arrived else "not-converged"
+
+
+def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray) -> Mapping[str, Any]:
+    agents: dict[str, Any] = {agent: {"margin": None, "constraints": []} for agent in team.ids}
+    for owner, name, margin, multiplier in zip(team.owner, team.names, margins, multipliers, strict=True):
+        agent = agents[team.ids[owner]]
+        value = number(margin)
+        agent["constraints"].append({"name": name, "margin": value, "multiplier": number(multiplier)})
+        agent["margin"] = value if agent["margin"] is None or value is None else min(agent["margin"], value)
+    return agents
+
+
+def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:
+    members: list[list[str]] = [[] for _ in range(int(cluster.max(initial=-1)) + 1)]
+    for agent, label in zip(team.ids, cluster, strict=True):
+        members[label].append(agent)
+    return members
+
+
+def number(value: Any) -> float | None:
+    """A float for JSON, which knows no infinity: null instead."""
+    return float(value) if np.isfinite(value) else None
