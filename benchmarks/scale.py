@@ -34,9 +34,9 @@ import consat as cs
 from consat.estimates import Estimates, Exchange
 from consat.numerics import float64
 from consat.objective import Nu, Objective, Schedule
+from consat.preparation import first_estimates
 from consat.protocols import FLOWS, ROUNDS, State
 from consat.quadratics import shape_of
-from consat.preparation import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
 from consat.simulate.flows import Problem, rate
