@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.constraints.library import within
-from consat.family import Family
 from consat.graphs import clusters, disconnected
 from consat.quadratics import Floats, Ints, expand, shape_of
 from consat.recession import Recession, recession
 from consat.scale import scale
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 SCHEMA = "consat.check/1"
 MOST_LISTED = 10_000

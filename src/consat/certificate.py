@@ -27,7 +27,7 @@ from consat.numerics import float64
 from consat.objective import Nu, Objective, evaluate, weigh
 from consat.quadratics import Expansion, Floats, Ints, expand, shape_of
 from consat.reference import middle
-from consat.team import Team
+from consat.teams.team import Team
 
 Verdict = Literal["feasible", "infeasible", "undecided"]
 

@@ -18,7 +18,7 @@ from consat.quadratics import shape_of
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
 from consat.settings import Settings, Start
-from consat.team import Team
+from consat.teams.team import Team
 
 DEFAULT_PROTOCOL = "admm"
 SHARP = 5e-4

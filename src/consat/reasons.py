@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.certificate import BINDING, bounds
-from consat.family import Family
 from consat.graphs import clusters
 from consat.numerics import float64
 from consat.quadratics import Bools, Floats, values_and_gradients
 from consat.reference import Optimum, cluster_margins, max_min
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 NAMED = 6
 """A conflict of more constraints than this is summed up by its heaviest."""

@@ -25,7 +25,7 @@ from consat.conic import Solution, maximise, units
 from consat.graphs import clusters
 from consat.quadratics import Bools, Expansion, Floats, Ints, expand, shape_of, values_and_gradients
 from consat.scale import scale
-from consat.team import Team
+from consat.teams.team import Team
 
 STARTS = 32
 """Starts for a team that is not concave."""

@@ -28,7 +28,7 @@ from consat.simulate.kernel import Body, Weather
 from consat.simulate.recording import Choice, Who
 from consat.simulate.rounds import simulate_rounds
 from consat.summary import summarise
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 

@@ -12,7 +12,7 @@ from consat.numerics import float64
 from consat.preparation import scenario_of, with_auxiliary
 from consat.scenario import Scenario
 from consat.summary import number
-from consat.team import Team
+from consat.teams.team import Team
 
 SCHEMA = "consat.solve/1"
 

@@ -14,7 +14,7 @@ from consat.objective import Objective, Schedule, weigh
 from consat.scale import Scale
 from consat.scenario import Scenario
 from consat.settings import Settings
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 SCHEMA = "consat.run/1"

@@ -30,7 +30,7 @@ from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
 from consat.simulate.kernel import Weather, world_of
 from consat.simulate.rounds import PATIENCE, Rules, stillness
 from consat.summary import number, status_of
-from consat.team import Team
+from consat.teams.team import Team
 
 SCHEMA = "consat.sweep/1"
 MOST_LISTED = 10_000
