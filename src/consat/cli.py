@@ -191,7 +191,7 @@ def _fit_together(scenario: str | None, resume: Path | None, out: Path | None, c
 def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     """Check schema, graphs, clusters, the paper's assumptions and the curvature of every constraint."""
     loaded = _load(scenario, overrides)
-    from consat.assumptions import report
+    from consat.central.assumptions import report
     from consat.graphs import require_connected
     from consat.views import tables
 

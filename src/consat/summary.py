@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
-from consat.certificate import bounds
+from consat.central.certificate import bounds
 from consat.objective import Objective, Schedule, weigh
 from consat.scale import Scale
 from consat.scenario import Scenario

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consat import __version__
-from consat.certificate import bounds
+from consat.central.certificate import bounds
 from consat.errors import InvalidSettings
 from consat.estimates import Layout
 from consat.numerics import float64

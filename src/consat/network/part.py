@@ -200,11 +200,11 @@ def split(
         InvalidTeam: a cluster is not connected by links.
         InvalidSettings: an address or an absent agent that the team does not have.
     """
+    from consat.central.quadratics import shape_of
     from consat.estimates import Estimates
     from consat.graphs import hops
     from consat.objective import Schedule
     from consat.preparation import first_estimates
-    from consat.quadratics import shape_of
     from consat.scale import automatic, scale
 
     team, settings = scenario.team, scenario.settings

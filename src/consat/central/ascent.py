@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.central.quadratics import Floats, Ints
 from consat.numerics import Groups, float64
 from consat.objective import Objective
-from consat.quadratics import Floats, Ints
 from consat.scale import SHARPNESS, Scale, start_box
 from consat.teams.team import Team
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from consat.quadratics import Block, Expansion, Floats, Ints, tangents
+from consat.central.quadratics import Block, Expansion, Floats, Ints, tangents
 from consat.teams.team import Team
 
 MOST_POLYTOPES = 2000
