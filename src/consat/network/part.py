@@ -204,7 +204,7 @@ def split(
     from consat.estimates import Estimates
     from consat.graphs import hops
     from consat.objective import Schedule
-    from consat.preparation import first_estimates
+    from consat.runs.preparation import first_estimates
     from consat.scale import automatic, scale
 
     team, settings = scenario.team, scenario.settings

@@ -9,9 +9,9 @@ import numpy as np
 
 from consat.central.certificate import BINDING, bounds
 from consat.numerics import float64
-from consat.preparation import scenario_of, with_auxiliary
+from consat.runs.preparation import scenario_of, with_auxiliary
+from consat.runs.summary import number
 from consat.scenario import Scenario
-from consat.summary import number
 from consat.teams.team import Team
 
 SCHEMA = "consat.solve/1"
