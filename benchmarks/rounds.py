@@ -30,13 +30,13 @@ from families import FAMILIES, Problem
 from jax import Array
 from scipy.optimize import minimize
 
-from consat.certificate import bounds
+from consat.central.certificate import bounds
+from consat.central.quadratics import values_and_gradients
+from consat.central.reference import cluster_margins, max_min
 from consat.estimates import Estimates
 from consat.numerics import Groups, float64, quick_compilation
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import ROUNDS, Rounds
-from consat.quadratics import values_and_gradients
-from consat.reference import cluster_margins, max_min
 from consat.scale import Scale, automatic, scale
 from consat.simulate.kernel import Weather, World, begin, many_rounds, world_of
 from consat.simulate.rounds import HOLD

@@ -31,12 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import consat as cs
+from consat.central.quadratics import shape_of
 from consat.estimates import Estimates, Exchange
 from consat.numerics import float64
 from consat.objective import Nu, Objective, Schedule
-from consat.preparation import first_estimates
 from consat.protocols import FLOWS, ROUNDS, State
-from consat.quadratics import shape_of
+from consat.runs.preparation import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
 from consat.simulate.flows import Problem, rate

@@ -12,28 +12,28 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
-    from consat.groups import Group, each
     from consat.result import Result
-    from consat.runner import resume, run
+    from consat.runs.runner import resume, run
+    from consat.runs.solving import solve
+    from consat.runs.sweeping import Sweep, sweep
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
-    from consat.solving import solve
-    from consat.sweeping import Sweep, sweep
-    from consat.team import Agent, Team
+    from consat.teams.groups import Group, each
+    from consat.teams.team import Agent, Team
 
 _HOME = {
     "constraints": ("Constraint", "apart", "box", "constraint", "displacement", "expr", "halfspace", "near", "outside", "within"),
     "errors": (
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
-    "groups": ("Group", "each"),
     "result": ("Result",),
-    "runner": ("resume", "run"),
-    "solving": ("solve",),
+    "runs.runner": ("resume", "run"),
+    "runs.solving": ("solve",),
+    "runs.sweeping": ("Sweep", "sweep"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
-    "sweeping": ("Sweep", "sweep"),
-    "team": ("Agent", "Team"),
+    "teams.groups": ("Group", "each"),
+    "teams.team": ("Agent", "Team"),
 }  # fmt: skip
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 

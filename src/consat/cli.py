@@ -146,7 +146,7 @@ def run(
     out = settings["out"] = resume or settings["out"]
     _fit_together(scenario, resume, out, settings["checkpoint"])
     loaded = None if scenario is None else _load(scenario, overrides)
-    from consat import runner
+    from consat.runs import runner
 
     with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, located(loaded):
         if loaded is None:
@@ -191,7 +191,7 @@ def _fit_together(scenario: str | None, resume: Path | None, out: Path | None, c
 def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     """Check schema, graphs, clusters, the paper's assumptions and the curvature of every constraint."""
     loaded = _load(scenario, overrides)
-    from consat.assumptions import report
+    from consat.central.assumptions import report
     from consat.graphs import require_connected
     from consat.views import tables
 
@@ -215,7 +215,7 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     """Find the best margin centrally, prove it, and say what stands in the way."""
     _cache_compilations()
     loaded = _load(scenario, overrides)
-    from consat.solving import solve as solve_team
+    from consat.runs.solving import solve as solve_team
     from consat.views import tables
 
     with located(loaded):
@@ -260,8 +260,8 @@ def sweep(
             f"--over {wrong[0]}: this must be PATH=VALUES, such as loss=0,0.1,0.3 or agents.a1.constraints.0.radius=0.5:2:16"
         )
     loaded = _load(scenario, (*overrides, *([] if seed is None else [f"start.seed={seed}"])))
-    from consat.sweeping import sweep as sweep_team
-    from consat.sweeping import values
+    from consat.runs.sweeping import sweep as sweep_team
+    from consat.runs.sweeping import values
     from consat.views import tables
 
     options = {path.strip(): values(text) for path, _, text in (each.partition("=") for each in over)}

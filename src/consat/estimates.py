@@ -16,10 +16,10 @@ import numpy as np
 from jax import Array
 
 from consat.errors import InvalidSettings
-from consat.family import distinct
 from consat.graphs import cluster_links, clusters, holders, require_connected
 from consat.numerics import Groups
-from consat.team import Team
+from consat.teams.family import distinct
+from consat.teams.team import Team
 
 Layout = Literal["full", "local"]
 

@@ -14,8 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from consat.errors import Fault, InvalidTeam
-from consat.family import distinct
-from consat.team import Team
+from consat.teams.family import distinct
+from consat.teams.team import Team
 
 if TYPE_CHECKING:
     import networkx as nx

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.family import Family
 from consat.numerics import Groups
 from consat.settings import Ramp, Smoothing
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 
 class Nu(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 
 from consat.errors import InvalidResult
 from consat.netcdf import FINAL, SCHEMA, UNITS, VARIABLES, axis_names
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.constraints.curvature import expand
-from consat.family import Family
 from consat.numerics import float64, once
 from consat.settings import Smoothing
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 SHARPNESS = 5.0
 """ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""

@@ -13,7 +13,7 @@ from consat.network.part import Part, read_part, split, write_part
 from consat.numerics import float64
 from consat.scenario import Scenario, load, loads
 from consat.scenario.files import Settings
-from consat.team import Agent, Team
+from consat.teams.team import Agent, Team
 from tests.networked.case_c import parts
 
 SPLIT = """

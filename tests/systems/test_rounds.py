@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import consat as cs
+from consat.central.reference import max_min
 from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.protocols import Admm, Proximal
-from consat.reference import max_min
 from consat.scale import scale
 from consat.simulate.kernel import Weather, world_of
 from consat.simulate.rounds import simulate_rounds

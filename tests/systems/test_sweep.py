@@ -15,7 +15,7 @@ from PIL import Image
 
 import consat as cs
 from consat.errors import InvalidScenario, InvalidSettings
-from consat.sweeping import values
+from consat.runs.sweeping import values
 
 CONSAT = Path(sysconfig.get_path("scripts")) / "consat"
 ALIKE = ("status", "verdict", "ending", "rounds", "messages", "floats_sent")

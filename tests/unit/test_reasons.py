@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.reasons import explain, restricted
-from consat.reference import max_min
+from consat.central.reasons import explain, restricted
+from consat.central.reference import max_min
 from tests.unit.teams import case
 
 A = cs.Agent

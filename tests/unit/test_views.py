@@ -27,7 +27,7 @@ from consat.errors import InvalidSettings
 from consat.numerics import float64
 from consat.objective import Nu, Objective
 from consat.result import Result
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace, satisfied_from
 from consat.views import animation, figures, scene, words
 

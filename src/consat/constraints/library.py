@@ -60,7 +60,7 @@ def near(agent: Other, radius: float, *, name: str | None = None, weight: float 
     """Stay near a teammate: ψ = r² − ‖x_i − x_j‖² (paper, case A). Concave.
 
     Args:
-        agent: id of j; in a group also a relation, see `consat.groups`.
+        agent: id of j; in a group also a relation, see `consat.teams.groups`.
         radius: r > 0, length.
         name: what reports call it.
         weight: positive factor on ψ.
@@ -76,7 +76,7 @@ def apart(agent: Other, radius: float, *, name: str | None = None, weight: float
     """Keep a distance from a teammate: ψ = ‖x_i − x_j‖² − r² (paper, case E). Not concave.
 
     Args:
-        agent: id of j; in a group also a relation, see `consat.groups`.
+        agent: id of j; in a group also a relation, see `consat.teams.groups`.
         radius: r > 0, length.
         name: what reports call it.
         weight: positive factor on ψ.
@@ -92,7 +92,7 @@ def displacement(agent: Other, vector: ArrayLike, radius: float, *, name: str | 
     """Hold a place relative to a teammate: ψ = r² − ‖x_i − x_j − v‖². Concave.
 
     Args:
-        agent: id of j; in a group also a relation, see `consat.groups`.
+        agent: id of j; in a group also a relation, see `consat.teams.groups`.
         vector: v, shape (d,), length: where i should be, seen from j.
         radius: r > 0, length.
         name: what reports call it.

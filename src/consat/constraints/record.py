@@ -52,7 +52,7 @@ class Constraint:
         kind: the name that errors and reports use, e.g. ``within``.
         psi: ``psi(*positions, **parameters) -> scalar``, JAX-traceable and continuously differentiable; each position is a (d,) array.
         reads: the agents whose positions `psi` takes, in that order; `OWNER` stands for the owner, and in a group
-            what is no text for whom a relation leads to (`consat.groups`).
+            what is no text for whom a relation leads to (`consat.teams.groups`).
         parameters: the keyword arguments of `psi`.
         name: what the user calls it; if None, the team derives one from the kind and the agents read.
         weight: positive factor on ψ.

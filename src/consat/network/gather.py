@@ -14,7 +14,7 @@ import numpy as np
 from consat.estimates import Estimates
 from consat.network.fleet import Event
 from consat.objective import Nu, Objective
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
 SAMPLE: Final = 0.05

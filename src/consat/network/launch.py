@@ -23,11 +23,11 @@ from consat.numerics import float64
 from consat.objective import Schedule
 from consat.protocols import ROUNDS
 from consat.result import Result
+from consat.runs.summary import summarise
 from consat.scale import automatic, scale
 from consat.scenario import Scenario
 from consat.settings import Settings
 from consat.simulate.rounds import HOLD, SETTLED
-from consat.summary import summarise
 from consat.trace import Ending
 
 PATIENCE: Final = 600.0

@@ -19,7 +19,6 @@ import numpy as np
 from pydantic import Field, StringConstraints, ValidationError
 
 from consat.errors import AT_KEY, Fault, InvalidSettings, closest, shown
-from consat.family import Family
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.scenario import Scenario, dump
@@ -27,7 +26,8 @@ from consat.scenario.document import LARGEST, Document, decode, read
 from consat.scenario.schema import build
 from consat.scenario.writing import write
 from consat.settings import Gain, Model, Number, Settings, Smoothing
-from consat.team import Agent, Team
+from consat.teams.family import Family
+from consat.teams.team import Agent, Team
 
 VERSION: Final = 1
 PORT: Final = 7447
@@ -200,11 +200,11 @@ def split(
         InvalidTeam: a cluster is not connected by links.
         InvalidSettings: an address or an absent agent that the team does not have.
     """
+    from consat.central.quadratics import shape_of
     from consat.estimates import Estimates
     from consat.graphs import hops
     from consat.objective import Schedule
-    from consat.preparation import first_estimates
-    from consat.quadratics import shape_of
+    from consat.runs.preparation import first_estimates
     from consat.scale import automatic, scale
 
     team, settings = scenario.team, scenario.settings

@@ -17,9 +17,9 @@ import numpy as np
 from jax import Array
 
 from consat.constraints.curvature import hessians
-from consat.family import Family, distinct
 from consat.numerics import once
-from consat.team import Team
+from consat.teams.family import Family, distinct
+from consat.teams.team import Team
 
 SMALL_TEAM = 2000
 """Up to so many agents are batched by size and padded, which compiles once; of more, those of the common patterns, which runs faster."""

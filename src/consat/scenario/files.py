@@ -15,7 +15,7 @@ from consat.scenario.overrides import override
 from consat.scenario.schema import build
 from consat.scenario.writing import write
 from consat.settings import Settings
-from consat.team import Team
+from consat.teams.team import Team
 
 _PACKAGE = resources.files("consat.scenario")
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from consat.constraints import KINDS, OWNER, Constraint, box
 from consat.errors import Fault, InvalidTeam
-from consat.family import Family
-from consat.groups import Each, Group
 from consat.scenario.document import resolve
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
-from consat.team import TOPOLOGIES, Team, topology
+from consat.teams.family import Family
+from consat.teams.groups import Each, Group
+from consat.teams.team import TOPOLOGIES, Team, topology
 
 WIDTH: Final = 110
 """Lists and mappings up to this many characters stand on one line."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.errors import InvalidResult
-from consat.team import Team
+from consat.teams.team import Team
 
 SCHEMA = "consat.checkpoint/1"
 NAME = "checkpoint.npz"

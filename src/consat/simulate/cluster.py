@@ -24,7 +24,7 @@ from consat.simulate.engine import CHUNK, Chunk, Kept
 from consat.simulate.kernel import Body, Now, Part, Spoken, Weather, World, begin, hear, precision_for, speak, world_of
 from consat.simulate.partition import Halo, Share, assign
 from consat.simulate.recording import Choice
-from consat.team import Team
+from consat.teams.team import Team
 
 PATIENCE = 600
 """How long processes wait for one another to compile, s."""

@@ -17,7 +17,7 @@ from consat.result import attributes, labels, variables
 from consat.simulate import checkpoint
 from consat.simulate.checkpoint import Checkpoint
 from consat.simulate.recording import Choice, Log
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 RESULT, LOG = "result.nc", "record.bin"

@@ -20,7 +20,7 @@ from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
 HOLD = 10.0

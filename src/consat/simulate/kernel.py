@@ -13,14 +13,14 @@ from jax import Array
 
 from consat import prox
 from consat.estimates import Estimates
-from consat.family import distinct
 from consat.graphs import hops
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
 from consat.scale import Region, Scale
 from consat.solver import LocalSolver
-from consat.team import Team
+from consat.teams.family import distinct
+from consat.teams.team import Team
 
 EXACT = prox.Precision(tolerance=1e-9)
 """Of every local step of a small team."""

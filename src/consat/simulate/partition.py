@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from consat.estimates import Estimates
-from consat.team import Team
+from consat.teams.team import Team
 
 
 def assign(team: Team, copies: Estimates, processes: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from consat.errors import InvalidSettings, closest
 from consat.estimates import Estimates
-from consat.team import Team
+from consat.teams.team import Team
 
 MOST_AGENTS = 10_000
 """Of larger teams a sample is recorded when nobody says of whom, …"""

@@ -21,7 +21,7 @@ from consat.simulate.engine import CHUNK, Chunk, Engine, Kept, OneProcess
 from consat.simulate.kernel import Body, Weather, world_of
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink, velocities
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Ending, Trace
 
 HOLD = 10

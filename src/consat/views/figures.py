@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 
 from consat.numerics import float64
 from consat.result import Result
-from consat.team import Team
+from consat.teams.team import Team
 
 if TYPE_CHECKING:
     import xarray as xr

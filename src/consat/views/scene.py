@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from consat.result import Result
-from consat.team import Team
+from consat.teams.team import Team
 from consat.views.figures import GREY, STYLES, colour, grid, marker, number, plain, recorded, regions, view
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000

@@ -23,7 +23,7 @@ ANSWER = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]open[/]"}
 
 
 def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """The findings of `consat.assumptions.report`, for people."""
+    """The findings of `consat.central.assumptions.report`, for people."""
     clusters = findings["clusters"]
     shape = f"{findings['count']} agents, {findings['constraint_count']} constraints, {findings['cluster_count']} clusters"
     yield f"[bold]{escape(name)}[/]: {shape}"

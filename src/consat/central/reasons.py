@@ -18,13 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from consat.certificate import BINDING, bounds
-from consat.family import Family
+from consat.central.certificate import BINDING, bounds
+from consat.central.quadratics import Bools, Floats, values_and_gradients
+from consat.central.reference import Optimum, cluster_margins, max_min
 from consat.graphs import clusters
 from consat.numerics import float64
-from consat.quadratics import Bools, Floats, values_and_gradients
-from consat.reference import Optimum, cluster_margins, max_min
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 NAMED = 6
 """A conflict of more constraints than this is summed up by its heaviest."""
@@ -66,7 +66,7 @@ def explain(team: Team, optimum: Optimum) -> list[str]:
 
     Args:
         team: the team.
-        optimum: what `consat.reference.max_min` found for it.
+        optimum: what `consat.central.reference.max_min` found for it.
     """
     if not len(team.owner):
         return ["No agent has a constraint."]

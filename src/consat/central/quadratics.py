@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from consat.constraints.curvature import Curvature, hessians, read_curvatures
-from consat.family import Family
 from consat.numerics import float64, once
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

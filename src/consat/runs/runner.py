@@ -15,9 +15,10 @@ import numpy as np
 from consat.errors import InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
-from consat.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.result import Result
+from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
+from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
 from consat.simulate import Stop
@@ -27,8 +28,7 @@ from consat.simulate.flows import simulate_flow
 from consat.simulate.kernel import Body, Weather
 from consat.simulate.recording import Choice, Who
 from consat.simulate.rounds import simulate_rounds
-from consat.summary import summarise
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 

@@ -4,7 +4,7 @@ Let ψ_k be concave, λ ≥ 0 with Σ λ = 1. A formation x that is better than 
 
     β̄(x) ≤ q(z) + ∇q(z)·(x − z) ≤ q(z) + Σ_i ‖∇_i q(z)‖ (R_i + ‖z_i − x̂_i‖),    q = Σ λ_k ψ_k,
 
-for ANY point z, R_i being how far better formations lie at most (`consat.levels`). So no solver need be trusted: λ and z only decide how
+for ANY point z, R_i being how far better formations lie at most (`levels`). So no solver need be trusted: λ and z only decide how
 sharp the bound is. z is Newton's maximiser of q, exact for quadratics; λ are softmax weights at x̂ over a ladder of ν, those at points
 found by climbing centrally (`refine`), and whatever the caller brings. Constraints that are not concave get no weight: what proves that
 the others cannot hold together proves it of all. Clusters have bounds of their own; those of the team are the smallest.
@@ -20,14 +20,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from consat.conic import normalised, units
+from consat.central.conic import normalised, units
+from consat.central.levels import radii, with_tangents
+from consat.central.quadratics import Expansion, Floats, Ints, expand, shape_of
+from consat.central.reference import middle
 from consat.graphs import clusters
-from consat.levels import radii, with_tangents
 from consat.numerics import float64
 from consat.objective import Nu, Objective, evaluate, weigh
-from consat.quadratics import Expansion, Floats, Ints, expand, shape_of
-from consat.reference import middle
-from consat.team import Team
+from consat.teams.team import Team
 
 Verdict = Literal["feasible", "infeasible", "undecided"]
 
@@ -84,7 +84,7 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
         positions: (N, d) x̂, length.
         nu: the ν of a run, whose own weights are then tried, too.
         refine: climb from x̂ centrally to sharpen the upper bound; without, it costs about as much as a dozen evaluations of the team.
-        multipliers: (M,) weights to try, such as those of `consat.reference.max_min`.
+        multipliers: (M,) weights to try, such as those of `consat.central.reference.max_min`.
     """
     x = np.asarray(positions, dtype=float)
     if not len(team.owner):

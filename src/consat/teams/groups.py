@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from consat.constraints.record import OWNER, Constraint, Number, Vector, flatten
 from consat.errors import Fault, closest, shown
-from consat.family import Counted, Derived, Part, Repeated
-from consat.parameters import LARGEST, Path, checked, checked_rows, is_number
+from consat.teams.family import Counted, Derived, Part, Repeated
+from consat.teams.parameters import LARGEST, Path, checked, checked_rows, is_number
 
 Ints = NDArray[np.int64]
 
@@ -56,7 +56,7 @@ def each(constraint: Any, *, of: Any = None, agent: Any = None) -> Each:
             constraint, and a centre or displacement may be ``"place"``.
         of: who has it: ``"first"``, ``"last"``, an id, a list of ids, ``{"every": k}`` (every k-th, on a grid along every axis), or an
             array of places in the group; all, if None.
-        agent: for an expression, whom ``other`` means in it; see `consat.groups`. ``self`` is the member.
+        agent: for an expression, whom ``other`` means in it; see `consat.teams.groups`. ``self`` is the member.
     """
     return Each(constraint, of, agent)
 

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.central.quadratics import Floats, Ints
 from consat.numerics import Groups, float64
 from consat.objective import Objective
-from consat.quadratics import Floats, Ints
 from consat.scale import SHARPNESS, Scale, start_box
-from consat.team import Team
+from consat.teams.team import Team
 
 LADDER = (0.2, 1.0, 5.0, 25.0)
 """ν in units of the automatic one: the first sees far, the last is close to the minimum itself."""

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consat.certificate import bounds
+from consat.central.certificate import bounds
+from consat.central.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings
 from consat.estimates import Estimates
 from consat.objective import Schedule
 from consat.protocols import FLOWS, ROUNDS
-from consat.quadratics import shape_of
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
 from consat.settings import Settings, Start
-from consat.team import Team
+from consat.teams.team import Team
 
 DEFAULT_PROTOCOL = "admm"
 SHARP = 5e-4
@@ -40,7 +40,7 @@ def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
 
 def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
     """The scenario with the auxiliary constraint added to every agent."""
-    from consat import assumptions
+    from consat.central import assumptions
 
     return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
 

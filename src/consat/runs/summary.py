@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
-from consat.certificate import bounds
+from consat.central.certificate import bounds
 from consat.objective import Objective, Schedule, weigh
 from consat.scale import Scale
 from consat.scenario import Scenario
 from consat.settings import Settings
-from consat.team import Team
+from consat.teams.team import Team
 from consat.trace import Trace
 
 SCHEMA = "consat.run/1"

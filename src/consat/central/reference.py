@@ -4,8 +4,8 @@
 
 Clusters are independent, so each is maximised for itself, and β̄* is the worst of them.
 
-* All ψ concave of degree ≤ 2: one cone program (`consat.conic`), exact.
-* Otherwise starts climb β by ν-continuation (`consat.ascent`), and the best is polished: ψ_k is replaced by its value, gradient and the
+* All ψ concave of degree ≤ 2: one cone program (`conic`), exact.
+* Otherwise starts climb β by ν-continuation (`ascent`), and the best is polished: ψ_k is replaced by its value, gradient and the
   concave part of its Hessian, and that cone program is solved within a trust region, again and again. Where ψ is a quadratic the
   replacement lies below it, so that steps only ever gain (the convex–concave procedure: Lipp, Boyd 2016); where ψ is concave it is exact
   to second order, so that they converge superlinearly.
@@ -20,12 +20,12 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
-from consat.ascent import climb, drawn
-from consat.conic import Solution, maximise, units
+from consat.central.ascent import climb, drawn
+from consat.central.conic import Solution, maximise, units
+from consat.central.quadratics import Bools, Expansion, Floats, Ints, expand, shape_of, values_and_gradients
 from consat.graphs import clusters
-from consat.quadratics import Bools, Expansion, Floats, Ints, expand, shape_of, values_and_gradients
 from consat.scale import scale
-from consat.team import Team
+from consat.teams.team import Team
 
 STARTS = 32
 """Starts for a team that is not concave."""

@@ -5,7 +5,7 @@ For concave ψ_k = c_k + b_k·y + ½ yᵀH_k y the level sets are compact iff
 
     {d : H_k d = 0 and b_k·d ≥ 0 for all k} = {0},
 
-and then the minimiser of f exists and is unique; otherwise there is none or a whole line of them (`consat.recession`). Constraints beyond
+and then the minimiser of f exists and is unique; otherwise there is none or a whole line of them (`recession`). Constraints beyond
 degree 2 can only shrink the level sets.
 """
 
@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from consat.central.quadratics import Floats, Ints, expand, shape_of
+from consat.central.recession import Recession, recession
 from consat.constraints.library import within
-from consat.family import Family
 from consat.graphs import clusters, disconnected
-from consat.quadratics import Floats, Ints, expand, shape_of
-from consat.recession import Recession, recession
 from consat.scale import scale
-from consat.team import Team
+from consat.teams.family import Family
+from consat.teams.team import Team
 
 SCHEMA = "consat.check/1"
 MOST_LISTED = 10_000

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from consat.certificate import BINDING, bounds
+from consat.central.certificate import BINDING, bounds
 from consat.numerics import float64
-from consat.preparation import scenario_of, with_auxiliary
+from consat.runs.preparation import scenario_of, with_auxiliary
+from consat.runs.summary import number
 from consat.scenario import Scenario
-from consat.summary import number
-from consat.team import Team
+from consat.teams.team import Team
 
 SCHEMA = "consat.solve/1"
 
 
 @float64
 def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> dict[str, Any]:
-    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.reference.max_min`.
+    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.central.reference.max_min`.
 
     Args:
         team: as in `run`.
@@ -29,8 +29,8 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
     Returns:
         what ``consat solve --json`` prints (schema consat.solve/1), and ``reasons``: what binds or conflicts, in words.
     """
-    from consat.reasons import explain
-    from consat.reference import max_min
+    from consat.central.reasons import explain
+    from consat.central.reference import max_min
 
     scenario = scenario_of(team)
     if auxiliary is not None:
@@ -58,6 +58,6 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
 
 def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
     """Says that the auxiliary constraint was added, and on whom it binds: then the radius is too small."""
-    from consat.assumptions import binding_auxiliaries
+    from consat.central.assumptions import binding_auxiliaries
 
     return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}

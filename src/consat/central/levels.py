@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from consat.quadratics import Block, Expansion, Floats, Ints, tangents
-from consat.team import Team
+from consat.central.quadratics import Block, Expansion, Floats, Ints, tangents
+from consat.teams.team import Team
 
 MOST_POLYTOPES = 2000
 """So many slanted polytopes are measured, each by a few small non-negative least squares; agents beyond count as unlimited."""

@@ -12,9 +12,9 @@ import numpy as np
 
 from consat.constraints.record import Constraint
 from consat.errors import Fault, InvalidExpression
-from consat.family import Part
 from consat.numerics import float64
-from consat.parameters import Path
+from consat.teams.family import Part
+from consat.teams.parameters import Path
 
 SUGGESTIONS = 20
 """Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from consat.quadratics import Block, Expansion, Floats, Ints
+from consat.central.quadratics import Block, Expansion, Floats, Ints
 
 FLAT = 1e-12
 """Eigenvalues below this part of the largest are rounding."""

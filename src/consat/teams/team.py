@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.constraints.record import OWNER, Constraint, Number, flatten
-from consat.entries import SUGGESTIONS, Entry, alike, trace
 from consat.errors import Fault, InvalidTeam, closest, shown
-from consat.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
-from consat.groups import Expansion, Group, faults_of, stems_clash
-from consat.parameters import Path, checked, vector
+from consat.teams.entries import SUGGESTIONS, Entry, alike, trace
+from consat.teams.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
+from consat.teams.groups import Expansion, Group, faults_of, stems_clash
+from consat.teams.parameters import Path, checked, vector
 
 if TYPE_CHECKING:
     import networkx as nx

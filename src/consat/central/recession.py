@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from consat.quadratics import Bools, Expansion, Floats, Ints
+from consat.central.quadratics import Bools, Expansion, Floats, Ints
 
 FLAT = 1e-10
 """A direction along which every ψ changes by less than this part of its own size is one that leaves it as it is. Ill-posed in between:
