@@ -33,7 +33,7 @@ import numpy as np
 import consat as cs
 from consat.central.quadratics import shape_of
 from consat.estimates import Estimates, Exchange
-from consat.numerics import float64
+from consat.numerics import float64, thorough_compilation
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import FLOWS, ROUNDS, State
 from consat.runs.preparation import first_estimates
@@ -112,7 +112,7 @@ def measure(name: str, count: int) -> Row:
         return kernel.many_rounds(protocol, world, now, number + jnp.arange(BLOCK, dtype=float), lambda seen: seen.margin)
 
     now, _ = jax.jit(kernel.begin, static_argnames=("protocol",))(protocol, world, first, jax.random.key(0))
-    several = jax.jit(rounds, donate_argnums=1).lower(world, now, jnp.asarray(0.0)).compile()
+    several = jax.jit(rounds, donate_argnums=1).lower(world, now, jnp.asarray(0.0)).compile(compiler_options=thorough_compilation())
     compiled = time.perf_counter() - begin
     margins: list[float] = []
     while len(margins) < MOST_ROUNDS and not (margins and min(margins[-BLOCK:]) > 0):
@@ -136,7 +136,11 @@ def flow_steps(team: cs.Team, copies: Estimates, nu: Nu, x: jax.Array) -> tuple[
         return State(at.x + STEP * slope.x, at.z + STEP * slope.z)
 
     start = flow.start(x + 0.0)
-    several = jax.jit(lambda at: jax.lax.fori_loop(0, BLOCK, once, at), donate_argnums=0).lower(start).compile()
+    several = (
+        jax.jit(lambda at: jax.lax.fori_loop(0, BLOCK, once, at), donate_argnums=0)
+        .lower(start)
+        .compile(compiler_options=thorough_compilation())
+    )
     step, copy, _, _ = beside_a_copy(several, start)
     return step, copy
 

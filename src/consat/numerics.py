@@ -54,6 +54,12 @@ def quick_compilation() -> dict[str, bool | int] | None:
     return {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
 
 
+def thorough_compilation() -> dict[str, bool | int] | None:
+    """Options for programs that run longer than they compile: on a CPU, so that what does not wait for one another is on all cores at once;
+    by default memory is shared between such parts, which makes them wait."""
+    return {"xla_cpu_enable_concurrency_optimized_scheduler": True} if jax.default_backend() == "cpu" else None
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Groups:

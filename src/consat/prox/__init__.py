@@ -41,11 +41,10 @@ class Memory(NamedTuple):
 
 def recall(plan: Plan, nu: Nu, x: Array, kappa: Array) -> Memory:
     """What to remember before the first step from x, (rows, d), at weights κ, (rows,)."""
-    x, kappa = _padded(x), _padded(kappa)
 
     def begin(batch: Batch, part: Part) -> tuple[Array, Array]:
         lanes = Lanes(batch, part.kinds, nu, jnp.zeros(part.rows.shape[-1]))
-        guess = cold(lanes, _gathered(x, part.rows), kappa[part.rows])
+        guess = cold(lanes, _gathered(x, part.rows), _gathered(kappa, part.rows))
         return guess.sigma, guess.sharpness
 
     found = [_by_chunk(batch, begin) for batch in plan.batches]
@@ -70,13 +69,12 @@ def step(
     Returns:
         (rows, d) the solution, the memory, and (rows,) the stiffness, NaN for rows that no constraint reads.
     """
-    near, last, weight = _padded(v), _padded(x), _padded(kappa)
     offset = jnp.broadcast_to(offset, memory.sigma.shape)
 
     def answers(solver: Callable[..., Found], batch: Batch, part: Part, guess: Guess | None = None, *rest: Array) -> tuple[Array, ...]:
         lanes = Lanes(batch, part.kinds, nu, offset[part.agents])
-        guess = guess or Guess(_gathered(last, part.rows), memory.sigma[part.agents], memory.sharpness[part.agents])
-        found = solver(lanes, _gathered(near, part.rows), weight[part.rows], guess, precision, *rest)
+        guess = guess or Guess(_gathered(x, part.rows), memory.sigma[part.agents], memory.sharpness[part.agents])
+        found = solver(lanes, _gathered(v, part.rows), _gathered(kappa, part.rows), guess, precision, *rest)
         return jnp.moveaxis(found.guess.y, 1, -1), found.stiffness, found.guess.sigma, found.guess.sharpness, found.done
 
     found = []
@@ -94,13 +92,12 @@ def step(
     )
 
 
-def _padded(rows: Array) -> Array:
-    return jnp.concatenate([rows, jnp.ones_like(rows[:1])])
-
-
 def _gathered(state: Array, rows: Array) -> Array:
-    """(rows, d) at (n, A) → (n, d, A)."""
-    return jnp.moveaxis(state[rows], -1, 1)
+    """(rows, …) at (n, A) → (n, …, A); 1 where padded."""
+    last = len(state) - 1
+    there = (rows <= last).reshape(*rows.shape, *[1] * (state.ndim - 1))
+    found = jnp.where(there, state[jnp.minimum(rows, last)], 1.0)  # a copy with a row behind it would cost as much again
+    return jnp.moveaxis(found, 1, -1)
 
 
 class Part(NamedTuple):
@@ -118,9 +115,8 @@ def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]
         return tuple(leaf[None] for leaf in function(batch, jax.tree.map(lambda leaf: leaf[0], parts)))
     if len(batch.rows) < MANY:
         return tuple(jax.lax.map(lambda part: function(batch, part), parts))
-    half = len(batch.rows) // 2
-    halves = [jax.tree.map(lambda leaf, s=side: leaf[s], parts) for side in (slice(half), slice(half, None))]
-    first, second = (jax.lax.map(lambda part: function(batch, part), side) for side in halves)
+    halves = jnp.arange(len(batch.rows) // 2), jnp.arange(len(batch.rows) // 2, len(batch.rows))
+    first, second = (jax.lax.map(lambda k: function(batch, jax.tree.map(lambda leaf: leaf[k], parts)), half) for half in halves)
     return tuple(jnp.concatenate(leaves) for leaves in zip(first, second, strict=True))
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import quick_compilation
+from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
 from consat.simulate.kernel import Now, Seen, World, begin, one_round, see
 from consat.simulate.recording import Choice
@@ -203,7 +203,7 @@ def _look(world: World, chosen: Chosen, now: Now) -> Kept:
 
 @functools.cache
 def _compiled(large: bool) -> tuple[Callable[..., tuple[Now, Chunk]], Callable[..., tuple[Now, Chunk]], Callable[..., Kept]]:
-    options = None if large else quick_compilation()
+    options = thorough_compilation() if large else quick_compilation()
     return (
         jax.jit(start, static_argnames=("protocol",), compiler_options=options),
         jax.jit(advance, static_argnames=("protocol", "capacity"), donate_argnames=("now",), compiler_options=options),

@@ -169,7 +169,7 @@ class World:
         own: (N,) rows of own positions.
         talker: (E,) who speaks at each end.
         pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
-        reach: most that a body moves in a round.
+        reach: most that a body moves in a round; None if it can jump.
         loss: see `Weather`.
         sleep: see `Weather`.
         pairs: how many directed pairs.
@@ -182,7 +182,7 @@ class World:
     own: Array
     talker: Array
     pair: Array
-    reach: Array
+    reach: Array | None
     loss: Array
     sleep: Array
     pairs: int = field(metadata={"static": True})
@@ -277,11 +277,16 @@ def hear(protocol: Rounds, world: World, now: Now, spoken: Spoken) -> tuple[Now,
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
     state = protocol.hear(spoken.state, jax.tree.map(ends.across, spoken.message), arrived, everyone)
     ages = agreement.hear(spoken.ages, ends.across(spoken.told), arrived)
-    target = state.x[world.own]
-    away = target - now.body
-    distance = jnp.linalg.norm(away, axis=1, keepdims=True)
-    body = jnp.where(distance > world.reach, now.body + away * (world.reach / jnp.where(distance > 0, distance, 1.0)), target)
+    body = _moved(now.body, state.x[world.own], world.reach)
     return Now(state, ages, body, spoken.key), jnp.all(agreement.known(ages, everyone) > 0)
+
+
+def _moved(body: Array, target: Array, reach: Array | None) -> Array:
+    if reach is None:
+        return target
+    away = target - body
+    distance = jnp.linalg.norm(away, axis=1, keepdims=True)
+    return jnp.where(distance > reach, body + away * (reach / jnp.where(distance > 0, distance, 1.0)), target)
 
 
 def see(world: World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
@@ -359,7 +364,7 @@ def world_of(
         own=jnp.asarray(copies.own),
         talker=jnp.asarray(talker),
         pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
-        reach=jnp.asarray(np.inf if body is None else body.speed / body.rate),
+        reach=None if body is None else jnp.asarray(body.speed / body.rate),
         loss=jnp.asarray(weather.loss),
         sleep=jnp.asarray(weather.sleep),
         pairs=len(pairs),
