@@ -25,6 +25,8 @@ SHARPNESS = 5.0
 """ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
 MARGIN = 4.0
 """How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
+RIM = 0.1
+"""How much farther out than the team's places, at most, estimates from far away begin."""
 
 
 class Scale(NamedTuple):
@@ -64,11 +66,11 @@ class Region(NamedTuple):
         return cls(jnp.asarray(size.center), jnp.asarray(size.reach))
 
     def nearby(self, x: jax.Array) -> jax.Array:
-        """(n, d) positions: unchanged inside, and from far away brought to at most twice as far out as inside, keeping their directions, so
-        that no two fall together."""
+        """(n, d) positions: unchanged inside, and from far away brought to its rim, a little farther out the farther they were, keeping
+        their directions, so that no two fall together."""
         away = (x - self.center[None, :]) / self.reach
         far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
-        return self.center[None, :] + self.reach * away * ((2.0 - 1.0 / far) / far)
+        return self.center[None, :] + self.reach * away * ((1.0 + RIM * (1.0 - 1.0 / far)) / far)
 
 
 @functools.lru_cache(maxsize=16)

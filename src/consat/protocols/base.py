@@ -116,8 +116,8 @@ class Solver(Protocol):
         ...
 
     def nearby(self, x: Array) -> Array:
-        """(rows, d) positions, brought to where the team's places are, which is common knowledge: unchanged inside, and from far away to at
-        most twice as far out, keeping their directions. Rows that nothing ties to anything stay."""
+        """(rows, d) positions, brought to where the team's places are, which is common knowledge: unchanged inside, and from far away to
+        their rim, keeping their directions. Rows that nothing ties to anything stay."""
         ...
 
     def recall(self, x: Array, kappa: Array) -> Memory:

@@ -2,7 +2,8 @@
 
 In stage s the agents minimise  Σ_i e^{−ν_s (α_i − t)} / 2^s  with ν_s = 2^s ν, where t, the margin of the team in the last stage, keeps
 the numbers near one. They find t by min-consensus: each passes on the smallest ᾱ_j it has heard of in its stage, and learns no more than
-that; a stage lasts long enough for the smallest to reach everyone. β̄* − β̄ ≤ (ln N + ln m̄)/ν_s (paper, eq. 12) halves with every stage.
+that; a stage lasts long enough for the smallest to reach everyone, and for penalties, which fall with every crossing, to come down.
+β̄* − β̄ ≤ (ln N + ln m̄)/ν_s (paper, eq. 12) halves with every stage.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class MaxMin:
         admm: how each stage is solved.
     """
 
-    stage: int = 12
-    crossings: int = 4
+    stage: int = 8
+    crossings: int = 6
     stages: int = 10
     rise: float = 2.0
     admm: Admm = field(default=Admm(fall=0.8, least=1e-4))

@@ -24,8 +24,13 @@ STRONGEST = 1e12
 """Where the multiplier outweighs κ by this much, an agent already does all it can for its own constraints, and σ stays."""
 UNSEARCHED = 2
 """Steps of a chunk that go without a line search."""
-SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
-"""Parts of a step that a line search tries."""
+REFUTED = 1e-2
+"""A bracket narrower than this part of the step that σ still wants was narrowed by a wrong sign, and opens on that side."""
+SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 2e-3)
+"""Parts of a step that a line search tries, …"""
+FINE = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)
+"""… and after `PATIENCE` iterations: along a kink between half-spaces steps are as long as v is far, and the kink as narrow as 1/ν."""
+PATIENCE = 10
 
 
 class Guess(NamedTuple):
@@ -180,14 +185,18 @@ class _Task(NamedTuple):
         alone = jax.lax.cond(
             jnp.any(~near & ~at.done), lambda: self.search(at, multiplier, ahead.descend), lambda: at.y + ahead.descend
         )  # fmt: skip
-        # … then both at once, σ within a bracket that only certain signs may narrow
+        # … then both at once, σ within a bracket that only likely signs may narrow, and that opens where one proves wrong
         drop = dot(model.slope, ahead.descend)
         certain = near & (jnp.abs(drop) <= 0.3 * jnp.abs(gap))
         low = jnp.where(certain & (gap > 0), jnp.maximum(at.low, sigma), at.low)
         high = jnp.where(certain & (gap < 0), jnp.minimum(at.high, sigma), at.high)
         wanted = here.wanted(drop)
-        bracketed = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
-        wanted = jnp.minimum(jnp.where(bracketed, 0.5 * (low + high), wanted), ceiling)
+        outside = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
+        below, width = wanted < low, high - low
+        refuted = outside & (width <= REFUTED * jnp.abs(wanted - sigma))
+        beyond = jnp.where(below, low - width, high + width)
+        wanted = jnp.minimum(jnp.where(refuted, beyond, jnp.where(outside, 0.5 * (low + high), wanted)), ceiling)
+        low, high = jnp.where(refuted & below, -jnp.inf, low), jnp.where(refuted & ~below, jnp.inf, high)
         together = at.y + ahead.to(wanted - sigma)
 
         sharp = at.sharpness >= 1.0
@@ -267,13 +276,13 @@ class _Task(NamedTuple):
         """Where along a step the function whose gradient the first equation is, is least."""
 
         def worth(scale: Array) -> Array:
-            y = at.y + scale * descend
+            y = at.y + scale[None] * descend
             return 0.5 * add_up(self.kappa * (y - self.v) ** 2) + multiplier * self.level(y, at.sharpness)
 
-        scales = jnp.array(SCALES)
+        scales = jnp.where(at.iterations >= PATIENCE, jnp.array(FINE)[:, None], jnp.array(SCALES)[:, None])
         worths = jax.vmap(worth)(scales)
         best = jnp.argmin(jnp.where(jnp.isnan(worths), jnp.inf, worths), axis=0)
-        return at.y + scales[best][None] * descend
+        return at.y + jnp.take_along_axis(scales, best[None], axis=0) * descend
 
     def settled(self, at: _Search, here: _Here) -> tuple[Array, Array]:
         """(A,) whether the first equation holds, and whether the second does, as far as float64 can tell."""
