@@ -25,8 +25,9 @@ SHARPNESS = 5.0
 """ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
 MARGIN = 4.0
 """How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
-RIM = 0.1
-"""How much farther out than the team's places, at most, estimates from far away begin."""
+RIM, ROOM = 0.1, 1.0
+"""How much farther out than the team's places, at most, estimates from far away begin: of a convex team, and of one that is not, where
+agents need room to find a way around one another."""
 
 
 class Scale(NamedTuple):
@@ -65,12 +66,12 @@ class Region(NamedTuple):
     def of(cls, size: Scale) -> Region:
         return cls(jnp.asarray(size.center), jnp.asarray(size.reach))
 
-    def nearby(self, x: jax.Array) -> jax.Array:
+    def nearby(self, x: jax.Array, convex: bool) -> jax.Array:
         """(n, d) positions: unchanged inside, and from far away brought to its rim, a little farther out the farther they were, keeping
         their directions, so that no two fall together."""
         away = (x - self.center[None, :]) / self.reach
         far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
-        return self.center[None, :] + self.reach * away * ((1.0 + RIM * (1.0 - 1.0 / far)) / far)
+        return self.center[None, :] + self.reach * away * ((1.0 + (RIM if convex else ROOM) * (1.0 - 1.0 / far)) / far)
 
 
 @functools.lru_cache(maxsize=16)

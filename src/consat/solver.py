@@ -55,7 +55,7 @@ class LocalSolver:
 
     def nearby(self, x: Array) -> Array:
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
-        return jnp.where(idle[:, None], x, self.region.nearby(x))
+        return jnp.where(idle[:, None], x, self.region.nearby(x, self.convex))
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)

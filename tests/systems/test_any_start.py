@@ -51,19 +51,20 @@ def bow(count: int, margin: float) -> cs.Team:
     return cs.Team([cs.Agent(ids[0], [cs.within([-half, 0], 1)]), *agents])
 
 
+@pytest.mark.parametrize(("convex", "rim"), [(True, 4.4), (False, 8.0)])
 @float64
-def test_region_keeps_what_is_near_and_bounds_what_is_far() -> None:
+def test_region_keeps_what_is_near_and_bounds_what_is_far(convex: bool, rim: float) -> None:
     region = Region(jnp.array([3.0, -1.0]), jnp.asarray(4.0))
     inside = np.array([[3.0, -1.0], [7.0, 3.0], [-1.0, 0.5]])
-    np.testing.assert_allclose(region.nearby(jnp.asarray(inside)), inside, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(region.nearby(jnp.asarray(inside), convex), inside, rtol=0, atol=1e-15)
     random = np.random.default_rng(0)
     far = np.array([3.0, -1.0]) + random.normal(size=(200, 2)) * 10.0 ** random.uniform(0.7, 8, (200, 1))
-    near = np.asarray(region.nearby(jnp.asarray(far))) - [3.0, -1.0]
-    assert np.abs(near).max() <= 4.4
+    near = np.asarray(region.nearby(jnp.asarray(far), convex)) - [3.0, -1.0]
+    assert np.abs(near).max() <= rim
     # the same directions, and no two together: what is farther stays farther along a ray
     away = far - [3.0, -1.0]
     np.testing.assert_allclose(near[:, 0] * away[:, 1], near[:, 1] * away[:, 0], rtol=1e-9)
-    ray = np.asarray(region.nearby(jnp.asarray(np.array([3.0, -1.0]) + np.outer(np.logspace(0, 5, 30), [1.0, 0.3]))))
+    ray = np.asarray(region.nearby(jnp.asarray(np.array([3.0, -1.0]) + np.outer(np.logspace(0, 5, 30), [1.0, 0.3])), convex))
     assert np.all(np.diff(ray[:, 0]) > 0)
 
 

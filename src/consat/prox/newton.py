@@ -26,11 +26,8 @@ UNSEARCHED = 2
 """Steps of a chunk that go without a line search."""
 REFUTED = 1e-2
 """A bracket narrower than this part of the step that σ still wants was narrowed by a wrong sign, and opens on that side."""
-SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 2e-3)
-"""Parts of a step that a line search tries, …"""
-FINE = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)
-"""… and after `PATIENCE` iterations: along a kink between half-spaces steps are as long as v is far, and the kink as narrow as 1/ν."""
-PATIENCE = 10
+SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
+"""Parts of a step that a line search tries."""
 
 
 class Guess(NamedTuple):
@@ -276,13 +273,13 @@ class _Task(NamedTuple):
         """Where along a step the function whose gradient the first equation is, is least."""
 
         def worth(scale: Array) -> Array:
-            y = at.y + scale[None] * descend
+            y = at.y + scale * descend
             return 0.5 * add_up(self.kappa * (y - self.v) ** 2) + multiplier * self.level(y, at.sharpness)
 
-        scales = jnp.where(at.iterations >= PATIENCE, jnp.array(FINE)[:, None], jnp.array(SCALES)[:, None])
+        scales = jnp.array(SCALES)
         worths = jax.vmap(worth)(scales)
         best = jnp.argmin(jnp.where(jnp.isnan(worths), jnp.inf, worths), axis=0)
-        return at.y + jnp.take_along_axis(scales, best[None], axis=0) * descend
+        return at.y + scales[best][None] * descend
 
     def settled(self, at: _Search, here: _Here) -> tuple[Array, Array]:
         """(A,) whether the first equation holds, and whether the second does, as far as float64 can tell."""
