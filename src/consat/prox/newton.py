@@ -24,8 +24,6 @@ STRONGEST = 1e12
 """Where the multiplier outweighs κ by this much, an agent already does all it can for its own constraints, and σ stays."""
 UNSEARCHED = 2
 """Steps of a chunk that go without a line search."""
-REFUTED = 1e-2
-"""A bracket narrower than this part of the step that σ still wants was narrowed by a wrong sign, and opens on that side."""
 SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
 """Parts of a step that a line search tries."""
 
@@ -182,18 +180,14 @@ class _Task(NamedTuple):
         alone = jax.lax.cond(
             jnp.any(~near & ~at.done), lambda: self.search(at, multiplier, ahead.descend), lambda: at.y + ahead.descend
         )  # fmt: skip
-        # … then both at once, σ within a bracket that only likely signs may narrow, and that opens where one proves wrong
+        # … then both at once, σ within a bracket that only certain signs may narrow
         drop = dot(model.slope, ahead.descend)
         certain = near & (jnp.abs(drop) <= 0.3 * jnp.abs(gap))
         low = jnp.where(certain & (gap > 0), jnp.maximum(at.low, sigma), at.low)
         high = jnp.where(certain & (gap < 0), jnp.minimum(at.high, sigma), at.high)
         wanted = here.wanted(drop)
-        outside = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
-        below, width = wanted < low, high - low
-        refuted = outside & (width <= REFUTED * jnp.abs(wanted - sigma))
-        beyond = jnp.where(below, low - width, high + width)
-        wanted = jnp.minimum(jnp.where(refuted, beyond, jnp.where(outside, 0.5 * (low + high), wanted)), ceiling)
-        low, high = jnp.where(refuted & below, -jnp.inf, low), jnp.where(refuted & ~below, jnp.inf, high)
+        bracketed = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
+        wanted = jnp.minimum(jnp.where(bracketed, 0.5 * (low + high), wanted), ceiling)
         together = at.y + ahead.to(wanted - sigma)
 
         sharp = at.sharpness >= 1.0
