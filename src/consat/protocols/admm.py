@@ -59,8 +59,7 @@ class Admm:
         penalty: ρ at the start, in 1/length².
         share: of the stiffness, that ρ_i moves towards.
         least: of the penalty at the start, below which ρ_i does not fall: agents with room to spare have no stiffness to speak of.
-        rise: how much ln ρ_i may rise in a round, …
-        steep: … and where some ψ are not concave: there stiff links settle who goes which way.
+        rise: how much ln ρ_i may rise in a round.
         fall: how much it may fall while a message crosses the team, once the agent knows that all are satisfied.
         horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
     """
@@ -71,7 +70,6 @@ class Admm:
     share: float = 0.3
     least: float = 1e-6
     rise: float = 0.005
-    steep: float = 0.02
     fall: float = 0.2
     horizon: float = 50.0
     name = "admm"
@@ -102,7 +100,7 @@ class Admm:
         stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
         goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.log(jnp.maximum(stiff, self.least * self.penalty / solver.length**2)))
         since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
-        rise = (self.rise if solver.convex else self.steep) / (1.0 + (round_ / horizon) ** 4)
+        rise = self.rise / (1.0 + (round_ / horizon) ** 4)
         fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
         wish = wish + jnp.clip(goal - wish, -fall, rise)
         here = links.at(x)

@@ -75,7 +75,7 @@ class MaxMin:
         sharper, above = 2.0 ** jnp.minimum(number, self.stages), jnp.where(number > 0, level, 0.0)
         # penalties may fall throughout, and settle once the last stage is over
         free = 1.0 + jnp.maximum(round_ - self.earliest(solver), 0.0) + jnp.zeros_like(known)
-        paced = replace(self.admm, rise=self.rise / stage, steep=self.rise / stage)
+        paced = replace(self.admm, rise=self.rise / stage)
         admm, message = paced.speak(state.admm, solver, within, free, sharper, above)
         margin = solver.margin(admm.x)
         # what was heard in the first half of a stage is of positions still on their way
