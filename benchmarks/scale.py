@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py [--most 1000000] [--teams convoy lattice swarm] [--out docs/benchmarks]
 
-Writes ``scale.md`` and ``scale.png``. Each team has a process to itself, so that its peak of memory is its own, and runs until it is
+Writes ``scale.md``, ``scale.png``, and ``scale.json``, from which teams that are not asked for are taken as last measured. Each team has a process to itself, so that its peak of memory is its own, and runs until it is
 satisfied; its rounds are warm then, and are timed in blocks, each beside an out-of-place `numpy.copyto` of as many bytes as the state has.
 So are steps of the paper's gradient flow over the same estimates, beside a copy of theirs. An exponent is the slope of the line through the
 times of the sizes from `LINEAR` on, in logarithms. Then `consat run` from the shell, everything included. Last, agent-updates a second of
@@ -247,6 +247,7 @@ def main() -> None:
     asked = parser.parse_args()
     counts = [count for count in COUNTS if count <= asked.most]
     lines: list[str] = []
+    asked.out.mkdir(parents=True, exist_ok=True)
 
     def say(line: str = "") -> None:
         lines.append(line)
@@ -259,32 +260,37 @@ def main() -> None:
     )
     say("![milliseconds a round and bytes an agent, against the number of agents](scale.png)\n")
     say("Protocol `admm` over local estimates. Satisfied: the first round after the last with a margin ≤ 0.\n")
+    if earlier := ", ".join(name for name in TEAMS if name not in asked.teams):
+        say(f"Measured before, with the same command: {earlier}.\n")
     say(
         "| team | agents | build, s | compile, s | satisfied from round | ms a warm round | × copying its state | ms a step of the flow "
         "| × copying its state | bytes of state an agent | peak, GiB |"
     )
     say("|---|---|---|---|---|---|---|---|---|---|---|")
     rows: list[Row] = []
-    for name in asked.teams:
-        for count in counts:
-            row = alone(measure, name, count)
+    kept = asked.out / "scale.json"
+    last = [Row(**row) for row in json.loads(kept.read_text())] if kept.exists() else []
+    for name in TEAMS:
+        measured = (alone(measure, name, count) for count in counts) if name in asked.teams else (row for row in last if row.team == name)
+        for row in measured:
             rows.append(row)
             say(
-                f"| {name} | {count:,} | {row.build:.2f} | {row.compile:.1f} | {row.satisfied or '–'} | {1e3 * row.round:.2f} "
-                f"| {row.ratio:.1f} | {1e3 * row.step:.2f} | {row.step_ratio:.1f} | {row.state / count:.0f} | {row.peak / 2**30:.2f} |"
+                f"| {name} | {row.agents:,} | {row.build:.2f} | {row.compile:.1f} | {row.satisfied or '–'} | {1e3 * row.round:.2f} "
+                f"| {row.ratio:.1f} | {1e3 * row.step:.2f} | {row.step_ratio:.1f} | {row.state / row.agents:.0f} | {row.peak / 2**30:.2f} |"
             )
     say()
-    for name in asked.teams:
+    for name in dict.fromkeys(row.team for row in rows):
         say(f"* {name}: a round takes time ∝ N^{exponent([row for row in rows if row.team == name]):.2f} from N = {LINEAR:,} on.")
-    asked.out.mkdir(parents=True, exist_ok=True)
+    kept.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
     draw(rows, asked.out / "scale.png")
     say("\n## From the shell\n\nThe second run of `consat run TEAM --set count=N --json`, importing, compiling and certifying included.\n")
     say("| team | agents | s | peak, GiB | status | satisfied from round | rounds |\n|---|---|---|---|---|---|---|")
-    for name in (name for name in SHELL if name in asked.teams):
-        from_the_shell(name, counts[-1])  # compiles
-        seconds, peak, said = from_the_shell(name, counts[-1])
+    for name in SHELL:
+        most = max((row.agents for row in rows if row.team == name), default=counts[-1])
+        from_the_shell(name, most)  # compiles
+        seconds, peak, said = from_the_shell(name, most)
         say(
-            f"| {name} | {counts[-1]:,} | {seconds:.1f} | {peak / 2**30:.2f} | {said['status']} | {said['satisfied_from']['round']} "
+            f"| {name} | {most:,} | {seconds:.1f} | {peak / 2**30:.2f} | {said['status']} | {said['satisfied_from']['round']} "
             f"| {said['rounds']} |"
         )
     say("\n## Small teams\n\nGradient flow by fixed steps, chain, every agent estimating all: agent-updates a second.\n")
