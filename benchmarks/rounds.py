@@ -415,9 +415,9 @@ def _targets(stages: Sequence[Stage], compared: Sequence[Stage]) -> str:
         for some in dict.fromkeys([*((box,) for box in compared_boxes), tuple(compared_boxes)]):
             ratios = np.array([_ratio(s, box, flow=flow) for s in feasible for box in some])
             lost = int(np.sum(~np.isfinite(ratios)))
-            middle = float(np.median(ratios))
-            shown = f"{middle:.0f}" if np.isfinite(middle) else "∞"
-            text = f"median {shown}, least {ratios.min():.0f}; in {lost} of {len(ratios)} cases the flow is not satisfied"
+            middle, least = float(np.median(ratios)), float(ratios.min())
+            shown, smallest = (f"{ratio:.0f}" if np.isfinite(ratio) else "∞" for ratio in (middle, least))
+            text = f"median {shown}, least {smallest}; in {lost} of {len(ratios)} cases the flow is not satisfied"
             rows.append((f"≥ 100 × fewer rounds than the flow sampled {words}, from {', '.join(map(_box, some))}", text, middle >= 100))
     for family in ("chain", "grid"):
         for box in BOXES:
