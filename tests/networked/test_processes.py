@@ -149,6 +149,15 @@ def children(pid: int) -> list[int]:
     return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Whoever is started hears Ctrl-C. Under nohup, and in the background of a script, it is ignored, which is handed on."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_launch_mends_what_crashes_and_ctrl_c_leaves_nothing_behind(tmp_path: Path) -> None:
     command = [*CONSAT, "launch", "case-c", "--until", "600", "--json"]
     with (tmp_path / "out").open("wb") as out, subprocess.Popen(command, stdout=out) as launch:
