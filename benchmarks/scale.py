@@ -32,9 +32,9 @@ import numpy as np
 
 import consat as cs
 from consat.central.quadratics import shape_of
-from consat.estimates import Estimates, Exchange
+from consat.estimates import Estimates
 from consat.numerics import float64, thorough_compilation
-from consat.objective import Nu, Objective, Schedule
+from consat.objective import Nu, Schedule
 from consat.protocols import FLOWS, ROUNDS, State
 from consat.runs.preparation import first_estimates
 from consat.scale import automatic, scale
@@ -57,6 +57,7 @@ MARKERS = {"convoy": "o", "lattice": "s", "swarm": "^"}
 SHELL = ("convoy", "lattice")
 """Teams that are run from the shell as well; a swarm is the same but for its minutes."""
 SMALL = (3, 10, 50, 200)
+FLOW = FLOWS["gradient-flow"]()
 
 
 class Row(NamedTuple):
@@ -131,20 +132,24 @@ def measure(name: str, count: int) -> Row:
 
 def flow_steps(team: cs.Team, copies: Estimates, nu: Nu, x: jax.Array) -> tuple[float, float]:
     """Seconds an explicit step of the gradient flow over local estimates, from x, and seconds of copying its state."""
-    flow, problem = FLOWS["gradient-flow"](), Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=float(nu.alpha), nu_beta=1.0)))
+    problem = Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=float(nu.alpha), nu_beta=1.0)))
+    start = FLOW.start(x + 0.0)
+    several = flow_program(problem, start, BLOCK)
+    step, copy, _, _ = beside_a_copy(lambda at: several(problem, at), start)
+    return step, copy
 
-    def once(_: int, at: State) -> State:
-        slope = rate(flow, problem, jnp.asarray(0.0), at)
+
+def flow_program(problem: Problem, start: State, steps: int) -> Callable[[Problem, State], State]:
+    """So many explicit steps of the gradient flow, compiled; the state is given up."""
+
+    def once(problem: Problem, at: State) -> State:
+        slope = rate(FLOW, problem, jnp.asarray(0.0), at)
         return State(at.x + STEP * slope.x, at.z + STEP * slope.z)
 
-    start = flow.start(x + 0.0)
-    several = (
-        jax.jit(lambda at: jax.lax.fori_loop(0, BLOCK, once, at), donate_argnums=0)
-        .lower(start)
-        .compile(compiler_options=thorough_compilation())
-    )
-    step, copy, _, _ = beside_a_copy(several, start)
-    return step, copy
+    def many(problem: Problem, at: State) -> State:
+        return jax.lax.fori_loop(0, steps, lambda _, at: once(problem, at), at)
+
+    return jax.jit(many, donate_argnums=1).lower(problem, start).compile(compiler_options=thorough_compilation())
 
 
 @float64
@@ -152,24 +157,14 @@ def small(count: int, seconds: float = 1.0) -> tuple[float, float]:
     """Agent-updates a second of the gradient flow, ẋ = −∇f − (Lx) − z, ż = Lx, every agent estimating all: consat's and NumPy's."""
     team = cs.load("convoy", [f"count={count}"]).team
     copies = Estimates.of(team, "full")
-    objective = Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count)
-    exchange, nu = copies.exchange(), Nu(1.0, 1.0)
+    problem = Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=1.0, nu_beta=1.0)))
     steps = 200
-
-    @jax.jit
-    def many(objective: Objective, exchange: Exchange, x: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def once(_: int, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            x, z = at
-            away = exchange.disagreement(x)
-            return x - STEP * (objective.gradient(x, nu) + away + z), z + STEP * away
-
-        return jax.lax.fori_loop(0, steps, once, (x, z))
-
-    x = jnp.asarray(np.random.default_rng(0).uniform(1.5, 2.5, (copies.count, 2)))
-    x, z = jax.block_until_ready(many(objective, exchange, x, jnp.zeros_like(x)))
+    state = FLOW.start(jnp.asarray(np.random.default_rng(0).uniform(1.5, 2.5, (copies.count, 2))))
+    many = flow_program(problem, state, steps)
+    state = jax.block_until_ready(many(problem, state))
     begin, done = time.perf_counter(), 0
     while time.perf_counter() - begin < seconds:
-        x, z = jax.block_until_ready(many(objective, exchange, x, z))
+        state = jax.block_until_ready(many(problem, state))
         done += steps
     return done * count / (time.perf_counter() - begin), _plain(count, seconds)
 
