@@ -60,6 +60,13 @@ def thorough_compilation() -> dict[str, bool | int] | None:
     return {"xla_cpu_enable_concurrency_optimized_scheduler": True} if jax.default_backend() == "cpu" else None
 
 
+def taken(elements: Array, index: Array, empty: float) -> Array:
+    """The elements, along their first axis, at an index that is padded with their number; `empty` there."""
+    last = len(elements) - 1
+    there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
+    return jnp.where(there, elements[jnp.minimum(index, last)], empty)  # a copy with a filler behind it would cost as much again
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Groups:
@@ -107,12 +114,6 @@ class Groups:
             return values if self.width == 1 else jnp.repeat(values, self.width, axis=0, total_repeat_length=self.count * self.width)
         return values[self.group]
 
-    def _taken(self, elements: Array, index: Array, empty: float) -> Array:
-        """The elements at an index that is padded with their number."""
-        last = len(elements) - 1
-        there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
-        return jnp.where(there, elements[jnp.minimum(index, last)], empty)  # a copy with a filler behind it would cost as much again
-
     def sum(self, elements: Array) -> Array:
         """(E, …) → (G, …): the sum over each group, 0 for an empty one."""
         return self._folded(elements, _SUM)
@@ -130,9 +131,9 @@ class Groups:
         if self.index is None:
             parts = jnp.moveaxis(elements.reshape(self.count, self.width, *elements.shape[1:]), 1, 0)
         elif self.width > UNROLLED:
-            parts = self._taken(elements, self.index, fold.empty)
+            parts = taken(elements, self.index, fold.empty)
         else:
-            return functools.reduce(fold.two, [self._taken(elements, index, fold.empty) for index in self.index])
+            return functools.reduce(fold.two, [taken(elements, index, fold.empty) for index in self.index])
         return functools.reduce(fold.two, list(parts)) if self.width <= UNROLLED else fold.axis(parts, axis=0)
 
     def logsumexp(self, elements: Array) -> tuple[Array, Array]:

@@ -13,6 +13,9 @@ from consat.objective import Nu, Objective
 from consat.protocols.base import Links
 from consat.scale import Region
 
+EXACT = prox.Precision(tolerance=1e-9)
+"""Of every local step of an agent alone, and of a small team."""
+
 
 @dataclass(frozen=True)
 class LocalSolver:

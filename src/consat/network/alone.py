@@ -14,10 +14,7 @@ from consat.network.part import Part
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.scale import Region
-from consat.solver import LocalSolver
-
-PRECISION = prox.Precision(tolerance=1e-9)
-"""Of the local step; as in `consat.simulate.kernel` for small teams."""
+from consat.solver import EXACT, LocalSolver
 
 
 @jax.tree_util.register_dataclass
@@ -91,7 +88,7 @@ class Alone(LocalSolver):
             talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
             hops=part.hops,
             convex=part.convex,
-            precision=PRECISION,
+            precision=EXACT,
             me=me,
         )
 

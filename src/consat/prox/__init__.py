@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from consat.numerics import taken
 from consat.objective import Nu
 from consat.prox.batches import SMALL_TEAM, Batch, Kind, Plan, buckets
 from consat.prox.lanes import Lanes
@@ -94,10 +95,7 @@ def step(
 
 def _gathered(state: Array, rows: Array) -> Array:
     """(rows, …) at (n, A) → (n, …, A); 1 where padded."""
-    last = len(state) - 1
-    there = (rows <= last).reshape(*rows.shape, *[1] * (state.ndim - 1))
-    found = jnp.where(there, state[jnp.minimum(rows, last)], 1.0)  # a copy with a row behind it would cost as much again
-    return jnp.moveaxis(found, 1, -1)
+    return jnp.moveaxis(taken(state, rows, 1.0), 1, -1)
 
 
 class Part(NamedTuple):

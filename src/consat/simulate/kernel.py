@@ -18,14 +18,12 @@ from consat.numerics import Groups
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
 from consat.scale import Region, Scale
-from consat.solver import LocalSolver
+from consat.solver import EXACT, LocalSolver
 from consat.teams.family import distinct
 from consat.teams.team import Team
 
-EXACT = prox.Precision(tolerance=1e-9)
-"""Of every local step of a small team."""
 QUICK = prox.Precision(tolerance=None)
-"""Of every local step of a large one: there the arithmetic counts, and an exact step saves no rounds. Each begins where the last ended, so
+"""Of every local step of a large team: there the arithmetic counts, and an exact step saves no rounds. Each begins where the last ended, so
 that the steps become exact as the team comes to rest."""
 
 
@@ -49,9 +47,9 @@ class Ends:
     block: int = field(metadata={"static": True})
 
     @classmethod
-    def of(cls, copies: Estimates) -> Ends:
-        receiver, sender, block = copies.ends()
-        here, there, count = receiver.astype(np.int64), sender.astype(np.int64), copies.count // block
+    def of(cls, receiver: np.ndarray, sender: np.ndarray, block: int, copies: int) -> Ends:
+        """Args: receiver, sender, block: see `consat.estimates.Estimates.ends`; copies: C."""
+        here, there, count = receiver.astype(np.int64), sender.astype(np.int64), copies // block
         other = np.searchsorted(here * count + there, there * count + here)
         degree = np.bincount(receiver, minlength=count)
         metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
@@ -340,7 +338,7 @@ def world_of(
     receiver, sender, block = copies.ends()
     talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
-        links=Ends.of(copies),
+        links=Ends.of(receiver, sender, block, copies.count),
         length=jnp.asarray(size.length),
         region=Region.of(size),
         plan=prox.buckets(team, copies.rows, copies.count, convex),
