@@ -17,7 +17,7 @@ from jax import Array
 
 from consat.errors import InvalidSettings
 from consat.graphs import cluster_links, clusters, holders, require_connected
-from consat.numerics import Groups
+from consat.numerics import Groups, pick
 from consat.teams.family import distinct
 from consat.teams.team import Team
 
@@ -44,7 +44,7 @@ class Exchange:
 
         def laplacian(m: Array) -> Array:
             blocks = m.reshape(-1, self.block, *m.shape[1:])
-            return self.arrivals.sum(self.arrivals.spread(blocks) - blocks[self.sender]).reshape(m.shape)
+            return self.arrivals.sum(self.arrivals.spread(blocks) - pick(blocks, self.sender)).reshape(m.shape)
 
         return jax.tree.map(laplacian, message)
 

@@ -54,17 +54,34 @@ def quick_compilation() -> dict[str, bool | int] | None:
     return {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
 
 
-def thorough_compilation() -> dict[str, bool | int] | None:
-    """Options for programs that run longer than they compile: on a CPU, so that what does not wait for one another is on all cores at once;
-    by default memory is shared between such parts, which makes them wait."""
-    return {"xla_cpu_enable_concurrency_optimized_scheduler": True} if jax.default_backend() == "cpu" else None
+def thorough_compilation() -> dict[str, bool | int | str] | None:
+    """Options for programs that run longer than they compile: on a CPU, so that what does not wait for one another is on all cores at once
+    (by default memory is shared between such parts, which makes them wait), and so that short sums, over the axes of space, are fused with
+    what is around them, not handed to a library."""
+    if jax.default_backend() != "cpu":
+        return None
+    return {"xla_cpu_enable_concurrency_optimized_scheduler": True, "xla_cpu_experimental_ynn_fusion_type": ""}
+
+
+FEW = 24
+"""Up to so many terms are added one by one: compilers fuse that with what is around it, but not a sum over an axis."""
+
+
+def add_up(terms: Array | Sequence[Array]) -> Array:
+    """Σ over the first axis, in order while there are few."""
+    return functools.reduce(operator.add, list(terms)) if 0 < len(terms) <= FEW else jnp.sum(jnp.asarray(terms), axis=0)
+
+
+def pick(elements: Array, index: Array) -> Array:
+    """``elements[index]``, for an index that is known to be in 0 … len − 1: nothing is spent on negative ones."""
+    return elements.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def taken(elements: Array, index: Array, empty: float) -> Array:
     """The elements, along their first axis, at an index that is padded with their number; `empty` there."""
     last = len(elements) - 1
     there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
-    return jnp.where(there, elements[jnp.minimum(index, last)], empty)  # a copy with a filler behind it would cost as much again
+    return jnp.where(there, pick(elements, jnp.minimum(index, last)), empty)  # a copy with a filler behind it would cost as much again
 
 
 @jax.tree_util.register_dataclass
@@ -112,7 +129,7 @@ class Groups:
         """(G, …) → (E, …): to each element the value of its group."""
         if self.index is None:
             return values if self.width == 1 else jnp.repeat(values, self.width, axis=0, total_repeat_length=self.count * self.width)
-        return values[self.group]
+        return pick(values, self.group)
 
     def sum(self, elements: Array) -> Array:
         """(E, …) → (G, …): the sum over each group, 0 for an empty one."""
@@ -125,7 +142,7 @@ class Groups:
     def _folded(self, elements: Array, fold: _Fold) -> Array:
         if not self.padded:
             assert self.index is not None
-            return fold.sorted(elements[self.index], self.group[self.index], self.count, indices_are_sorted=True)
+            return fold.sorted(pick(elements, self.index), pick(self.group, self.index), self.count, indices_are_sorted=True)
         if self.width == 0 or self.count == 0:
             return jnp.full((self.count, *elements.shape[1:]), fold.empty, elements.dtype)
         if self.index is None:

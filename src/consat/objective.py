@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import Groups
+from consat.numerics import Groups, pick
 from consat.settings import Ramp, Smoothing
 from consat.teams.family import Family
 from consat.teams.team import Team
@@ -89,17 +89,19 @@ class Batch:
     weight: Array
     psi: Callable[..., Any] = field(metadata={"static": True})
 
-    def value(self, arguments: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
-        """The weighted ψ of one member at its (arity, d) arguments."""
-        return weight * self.psi(*arguments, **parameters)
-
     def values(self, x: Array) -> Array:
         """(M_f,) weighted ψ at a state (rows, d)."""
-        return jax.vmap(self.value)(x[self.rows], self.parameters, self.weight)
+        return self.weight * self._of_all(lambda at, p: self.psi(*at, **p), x)
 
     def gradients(self, x: Array) -> tuple[Array, Array]:
-        """(M_f,) values and (M_f, arity, d) gradients with respect to the arguments."""
-        return jax.vmap(jax.value_and_grad(self.value))(x[self.rows], self.parameters, self.weight)
+        """(M_f,) values and (arity, d, M_f) gradients with respect to the arguments."""
+        values, gradients = self._of_all(jax.value_and_grad(lambda at, p: self.psi(*at, **p)), x)
+        return self.weight * values, self.weight[None, None] * gradients
+
+    def _of_all(self, function: Callable[..., Any], x: Array) -> Any:
+        """A function of the (arity, d) arguments and the parameters of one constraint, for all, which come last."""
+        parameters = {key: jnp.moveaxis(value, 0, -1) for key, value in self.parameters.items()}
+        return jax.vmap(function, in_axes=-1, out_axes=-1)(jnp.moveaxis(pick(x, self.rows), 0, -1), parameters)
 
 
 @jax.tree_util.register_dataclass
@@ -198,8 +200,8 @@ class Objective:
         values, gradients = zip(*(batch.gradients(x) for batch in self.batches), strict=True) if self.batches else ((), ())
         weights = weigh(*self.owners.logsumexp(-nu.alpha * jnp.concatenate([jnp.zeros(0), *values])))
         ends = np.cumsum([len(value) for value in values])[:-1]
-        pieces = [w[:, None, None] * g for w, g in zip(jnp.split(weights, ends), gradients, strict=True)] if gradients else []
-        flat = [piece.reshape(-1, x.shape[-1]) for piece in pieces]
+        pieces = [w[None, None] * g for w, g in zip(jnp.split(weights, ends), gradients, strict=True)] if gradients else []
+        flat = [jnp.moveaxis(piece, -1, 0).reshape(-1, x.shape[-1]) for piece in pieces]
         return self.arguments.sum(jnp.concatenate([jnp.zeros((0, x.shape[-1])), *flat]))
 
 

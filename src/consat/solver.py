@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat import prox
-from consat.numerics import Groups
+from consat.numerics import Groups, pick
 from consat.objective import Nu, Objective
 from consat.protocols.base import Links
 from consat.scale import Region
@@ -64,7 +64,7 @@ class LocalSolver:
         return self.local.agent_margins(x)
 
     def to_rows(self, numbers: Array) -> Array:
-        return numbers[self.holder]
+        return pick(numbers, self.holder)
 
     def least(self, numbers: Array) -> Array:
         return -self.talkers.max(-numbers)

@@ -15,7 +15,7 @@ from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.prox import batches
-from consat.prox.lanes import LOOPED, UNROLLED, solve_symmetric
+from consat.prox.hessians import LOOPED, UNROLLED, solve_symmetric
 
 EXACT = prox.Precision(1e-10)
 ONE_STEP = prox.Precision(None)

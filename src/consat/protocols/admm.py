@@ -81,34 +81,33 @@ class Admm:
     def start(self, x: Array, solver: Solver) -> AdmmState:
         x = solver.nearby(x)
         at_links = solver.links.at(x)
-        wish = jnp.zeros(len(x)) + jnp.log(self.penalty / solver.length**2)
+        wish = jnp.zeros(len(x)) + self.penalty / solver.length**2
         level = solver.links.at(wish)
-        return AdmmState(x, at_links, wish, level, level, solver.recall(x, jnp.exp(wish)))
+        return AdmmState(x, at_links, wish, level, level, solver.recall(x, wish))
 
     def speak(
         self, state: AdmmState, solver: Solver, round_: Array, known: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
     ) -> tuple[AdmmState, tuple[Array, Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
-        penalty = 0.5 * (links.at(wish) + state.heard)
-        u = links.at(x) + (u - links.at(x)) * jnp.exp(state.penalty - penalty)[:, None]
-        rho = jnp.exp(penalty)
+        rho = jnp.sqrt(links.at(wish) * state.heard)
+        u = links.at(x) + (u - links.at(x)) * (state.penalty / rho)[:, None]
         kappa, linked = links.sum(rho), links.degree > 0
         v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
-        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, jnp.exp(wish)), x, state.memory, sharper, above)
+        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, wish), x, state.memory, sharper, above)
         neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
         stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
-        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.log(jnp.maximum(stiff, self.least * self.penalty / solver.length**2)))
+        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.maximum(stiff, self.least * self.penalty / solver.length**2))
         since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
         rise = self.rise / (1.0 + (round_ / horizon) ** 4)
         fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
-        wish = wish + jnp.clip(goal - wish, -fall, rise)
+        wish = jnp.clip(goal, wish * (1.0 - fall), wish * (1.0 + rise))
         here = links.at(x)
-        return AdmmState(x, u, wish, state.heard, penalty, memory), (here, rho[:, None] * (u - here), links.at(wish))
+        return AdmmState(x, u, wish, state.heard, rho, memory), (here, rho[:, None] * (u - here), links.at(wish))
 
     def hear(self, state: AdmmState, message: tuple[Array, Array, Array], arrived: Array, solver: Solver) -> AdmmState:
         there, force, wish = message
-        q = there - force / jnp.exp(state.penalty)[:, None]
+        q = there - force * (1.0 / state.penalty)[:, None]
         a = self.relaxation if solver.convex else min(self.relaxation, self.cautious)
         u = jnp.where(arrived[:, None], (1 - a) * state.u + a * q, state.u)
         return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))

@@ -20,17 +20,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.numerics import taken
+from consat.numerics import pick, taken
 from consat.objective import Nu
-from consat.prox.batches import SMALL_TEAM, Batch, Kind, Plan, buckets
+from consat.prox.batches import MANY, PAIR, SMALL_TEAM, Batch, Kind, Plan, buckets
 from consat.prox.lanes import Lanes
 from consat.prox.newton import MOST_ITERATIONS, STRONGEST, Found, Guess, Precision, cold, solve, solve_most
 
 __all__ = ["MOST_ITERATIONS", "SMALL_TEAM", "STRONGEST", "Guess", "Memory", "Plan", "Precision", "buckets", "recall", "step"]
-
-
-MANY = 16
-"""Of so many chunks or more two are worked on at a time: what does not wait for one another runs on cores of its own."""
 
 
 class Memory(NamedTuple):
@@ -107,15 +103,23 @@ class Part(NamedTuple):
 
 
 def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]) -> tuple[Array, ...]:
-    """What a function gives for every chunk, stacked."""
-    parts = Part(batch.agents, batch.rows, batch.kinds)
-    if len(batch.rows) == 1:
-        return tuple(leaf[None] for leaf in function(batch, jax.tree.map(lambda leaf: leaf[0], parts)))
-    if len(batch.rows) < MANY:
-        return tuple(jax.lax.map(lambda part: function(batch, part), parts))
-    halves = jnp.arange(len(batch.rows) // 2), jnp.arange(len(batch.rows) // 2, len(batch.rows))
-    first, second = (jax.lax.map(lambda k: function(batch, jax.tree.map(lambda leaf: leaf[k], parts)), half) for half in halves)
-    return tuple(jnp.concatenate(leaves) for leaves in zip(first, second, strict=True))
+    """What a function gives for every chunk, stacked. Of many chunks two are worked on at a time: what does not wait for one another runs
+    on cores of its own."""
+    parts, chunks = Part(batch.agents, batch.rows, batch.kinds), len(batch.rows)
+    together = PAIR if chunks >= MANY else 1
+
+    def some(parts: Part) -> tuple[Array, ...]:
+        found = [function(batch, _one(parts, k)) for k in range(together)]
+        return tuple(jnp.stack(leaves) for leaves in zip(*found, strict=True))
+
+    if chunks == 1:
+        return some(parts)
+    found = jax.lax.map(some, jax.tree.map(lambda leaf: leaf.reshape(-1, together, *leaf.shape[1:]), parts))
+    return tuple(leaf.reshape(chunks, *leaf.shape[2:]) for leaf in found)
+
+
+def _one(parts: Part, k: int) -> Part:
+    return jax.tree.map(lambda leaf: leaf[k], parts)
 
 
 def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[..., tuple[Array, ...]]) -> tuple[Array, ...]:
@@ -153,4 +157,4 @@ def _put_back(where: Array, found: list[Array], others: Array) -> Array:
         return others
     flat = jnp.concatenate([each.reshape(-1, *others.shape[1:]) for each in found])
     answered = where < len(flat)
-    return jnp.where(answered.reshape(-1, *[1] * (others.ndim - 1)), flat[jnp.minimum(where, len(flat) - 1)], others)
+    return jnp.where(answered.reshape(-1, *[1] * (others.ndim - 1)), pick(flat, jnp.minimum(where, len(flat) - 1)), others)

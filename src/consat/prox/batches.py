@@ -30,6 +30,9 @@ SQUARE = 2**15
 WIDEST, NARROWEST = 2048, 64
 """Agents in a chunk."""
 
+MANY, PAIR = 16, 2
+"""Of so many chunks or more there is an even number."""
+
 Matrix = tuple[tuple[float, ...], ...]
 
 
@@ -275,6 +278,7 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
     agents, n = len(group.agents), len(group.positions)
     width = min(max(SQUARE // (n * team.dimension) ** 2, NARROWEST), WIDEST)
     chunks = -(-agents // width)
+    chunks += -chunks % PAIR if chunks >= MANY else 0
     width = -(-agents // chunks)
     full = np.minimum(np.arange(chunks * width), agents - 1)
 

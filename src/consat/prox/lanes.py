@@ -10,8 +10,7 @@ Sums run in a fixed order, and no lane knows how many others there are: what an 
 from __future__ import annotations
 
 import functools
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,25 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.numerics import add_up
 from consat.objective import Nu
-from consat.prox.batches import Batch, Form, Kind
-
-FEW = 24
-"""Up to so many terms are added one by one."""
-UNROLLED = 8
-"""Systems of up to so many unknowns are eliminated by a program written out, …"""
-LOOPED = 24
-"""… of up to so many by a loop, and larger ones by LAPACK."""
-
-
-def add_up(terms: Array | Sequence[Array]) -> Array:
-    """Σ over the first axis, in order while there are few."""
-    return functools.reduce(operator.add, list(terms)) if len(terms) <= FEW else jnp.sum(jnp.asarray(terms), axis=0)
-
-
-def dot(a: Array, b: Array) -> Array:
-    """(n, A), (n, A) → (A,)."""
-    return add_up(a * b)
+from consat.prox.batches import Batch, Form, Kind, Matrix
+from consat.prox.hessians import Alike, Dense
 
 
 class Expanded(NamedTuple):
@@ -48,13 +32,11 @@ class Expanded(NamedTuple):
         level: (A,) L.
         slope: (N, A) ∇L, N = n·d.
         bend: (N, N, A) ∇²L.
-        safe: the same without what is not convex; None where that is not known apart.
     """
 
     level: Array
     slope: Array
-    bend: Array
-    safe: Array | None
+    bend: Dense | Alike
 
 
 @dataclass(frozen=True)
@@ -101,32 +83,34 @@ class Lanes:
         """L to second order at y, (n, d, A)."""
         if not self.batch.known:
             return self._expand_any(y, sharpness)
-        n, d, lanes = y.shape
-        values, gradients, bends, safes = [], [], [], []
+        n, d, _ = y.shape
+        values, gradients, places, weights = [], [], [], []
         for form, kind in zip(self.batch.forms, self.kinds, strict=True):
             value, slope = _slopes(form, kind, y)
             values.append(value)
             assert form.slots is not None
-            assert form.bend is not None
             for k, slots in enumerate(form.slots):
                 gradients.append(_placed(slope[k], slots, n))
-                bend, safe = _constant(form.bend, slots, n, d)
-                weight = 1.0 if kind.weight is None else kind.weight[k]
-                bends.append((bend, weight))
-                safes.append((safe, weight))
+                places.append((form.bend, slots))
+                weights.append(1.0 if kind.weight is None else kind.weight[k])
         level, p = self._soft(jnp.concatenate(values), sharpness)
-        mean = add_up([p[k][None] * g for k, g in enumerate(gradients)])
-        spread: Array | float = 0.0
-        if len(gradients) > 1:
-            away = [g - mean for g in gradients]
-            spread = (sharpness * self.nu.alpha)[None, None] * add_up([(p[k][None] * a)[:, None] * a[None] for k, a in enumerate(away)])
+        mean, away = _spread(gradients, p)
+        directions = [(self.nu.beta * self.nu.alpha * sharpness * share, a) for share, a in away]
 
-        def curvature(constant: list[tuple[np.ndarray, Array | float]]) -> Array:
-            bent = [(jnp.asarray(matrix), p[k] * weight) for k, (matrix, weight) in enumerate(constant) if matrix.any()]
-            terms = [matrix[:, :, None] * weight[None, None] for matrix, weight in bent]
-            return self.nu.beta * ((add_up(terms) if terms else jnp.zeros((n * d, n * d, lanes))) + spread)
+        def constant(whole: Callable[..., np.ndarray]) -> Array:
+            """Σ_k p_k w_k ∇²v_k, of matrices that `whole` gives."""
+            matrices = [whole(*place, n, d) for place in places]
+            terms = [jnp.asarray(m)[:, :, None] * (p[k] * weights[k])[None, None] for k, m in enumerate(matrices) if m.any()]
+            return self.nu.beta * add_up(terms) if terms else jnp.zeros((*matrices[0].shape, y.shape[-1]))
 
-        return Expanded(level, self.nu.beta * mean, curvature(bends), None if self.batch.convex else curvature(safes))
+        bend: Dense | Alike
+        if self.batch.convex and len(gradients) <= n * d and all(_alike(bend, d) is not None for bend, _ in places):
+            bend = Alike(constant(_block), directions, d)
+        else:
+            spread = add_up([(share[None] * a)[:, None] * a[None] for share, a in directions]) if directions else 0.0
+            convex = self.batch.convex
+            bend = Dense(constant(_whole) + spread, None if convex else constant(_convex_part) + spread, convex)
+        return Expanded(level, self.nu.beta * mean, bend)
 
     def _expand_any(self, y: Array, sharpness: Array) -> Expanded:
         """The same for any ψ and any pattern, by automatic differentiation, an agent at a time."""
@@ -142,7 +126,8 @@ class Lanes:
             return value, slope, bend
 
         found = jax.vmap(one, in_axes=-1, out_axes=-1)(y.reshape(n * d, -1), self.kinds, self.offset, sharpness)
-        return Expanded(*found, None)
+        value, slope, bend = found
+        return Expanded(value, slope, Dense(bend, None, self.batch.convex))
 
 
 def _twice(function: Callable[[Array], Array], y: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -150,14 +135,15 @@ def _twice(function: Callable[[Array], Array], y: Array) -> tuple[Array, tuple[A
     return slope, (value, slope)
 
 
-def _arguments(form: Form, kind: Kind, y: Array) -> Array:
-    """(m, arity, d, A) the positions that each ψ takes."""
+def _arguments(form: Form, kind: Kind, y: Array) -> list[Array]:
+    """(m, d, A) the positions that each ψ takes, for each of its arguments."""
     if form.slots is not None:
-        return jnp.stack([jnp.stack([y[slot] for slot in slots]) for slots in form.slots])
+        return [jnp.stack([y[slot] for slot in slots]) for slots in zip(*form.slots, strict=True)]
     assert kind.slots is not None
     m, arity, _ = kind.slots.shape
     flat = kind.slots.reshape(m * arity, 1, -1)
-    return jnp.take_along_axis(y, flat, axis=0).reshape(m, arity, y.shape[1], -1)
+    found = jnp.take_along_axis(y, flat, axis=0).reshape(m, arity, y.shape[1], -1)
+    return [found[:, k] for k in range(arity)]
 
 
 def _along(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -177,7 +163,8 @@ def _violations(form: Form, kind: Kind, y: Array) -> Array:
 def _slopes(form: Form, kind: Kind, y: Array) -> tuple[Array, Array]:
     """(m, A) −ψ and (m, arity, d, A) its gradients."""
     function = jax.value_and_grad(lambda x, p: -form.psi(*x, **p))
-    values, slopes = _along(function)(_arguments(form, kind, y), kind.parameters)
+    values, found = _along(function)(_arguments(form, kind, y), kind.parameters)
+    slopes = jnp.stack(found, axis=1)
     if kind.weight is not None:
         slopes = kind.weight[:, None, None] * slopes
     return _masked(kind, values), slopes if kind.used is None else jnp.where(kind.used[:, None, None], slopes, 0.0)
@@ -189,61 +176,45 @@ def _placed(slope: Array, slots: tuple[int, ...], n: int) -> Array:
     return jnp.concatenate([slope[slots.index(row)] if row in slots else nothing for row in range(n)])
 
 
+def _spread(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+    """The mean ḡ = Σ_k p_k g_k, and Σ_k p_k (g_k − ḡ)(g_k − ḡ)ᵀ as Σ w a aᵀ with one term less (West's recurrence), (w, a) each."""
+    mean, total, terms = gradients[0], p[0], []
+    for g, share in zip(gradients[1:], p[1:], strict=True):
+        away, before, total = g - mean, total, total + share
+        part = share / jnp.maximum(total, jnp.finfo(total.dtype).tiny)
+        terms.append((before * part, away))
+        mean = mean + part[None] * away
+    return mean, terms
+
+
+def _placement(slots: tuple[int, ...], d: int) -> np.ndarray:
+    return (np.array(slots)[:, None] * d + np.arange(d)).ravel()
+
+
 @functools.cache
-def _constant(bend: tuple[tuple[float, ...], ...], slots: tuple[int, ...], n: int, d: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, N) ∇²v on all rows, and its convex part."""
-    matrix = np.array(bend)
-    values, vectors = np.linalg.eigh(matrix)
-    index = (np.array(slots)[:, None] * d + np.arange(d)).ravel()
-    whole = np.zeros((2, n * d, n * d))
-    whole[0][np.ix_(index, index)] = matrix
-    whole[1][np.ix_(index, index)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return whole[0], whole[1]
+def _whole(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
+    """(N, N) ∇²v on all rows."""
+    index, whole = _placement(slots, d), np.zeros((n * d, n * d))
+    whole[np.ix_(index, index)] = bend
+    return whole
 
 
-def solve_symmetric(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """Solve a system in every lane.
-
-    Args:
-        matrix: (N, N, A) symmetric.
-        right: (N, r, A).
-
-    Returns:
-        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
-    """
-    size = len(matrix)
-    if size > LOOPED:
-        first = jnp.moveaxis(matrix, -1, 0)
-        found = jnp.moveaxis(jnp.linalg.solve(first, jnp.moveaxis(right, -1, 0)), 0, -1)
-        return found, jnp.linalg.eigvalsh(first)[:, 0] > 0 if size <= 4 * LOOPED else jnp.ones(matrix.shape[-1], bool)
-    whole = jnp.concatenate([matrix, right], axis=1)
-    return _looped(whole, size) if size > UNROLLED else _unrolled(whole, size)
+@functools.cache
+def _convex_part(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
+    """(N, N) the same without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh(np.array(bend))
+    return _whole(tuple(map(tuple, (vectors * np.maximum(values, 0.0)) @ vectors.T)), slots, n, d)
 
 
-def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
-    """LDLᵀ. Each step goes into the array as it stands, which keeps the compiler from computing earlier steps over and over."""
-    put = jax.lax.dynamic_update_slice
-    for j in range(size - 1):
-        factor = whole[j + 1 :, j] / whole[j, j][None]
-        whole = put(whole, whole[j + 1 :, j + 1 :] - factor[:, None] * whole[j, j + 1 :][None], (j + 1, j + 1, 0))
-    positive = functools.reduce(operator.and_, [whole[j, j] > 0 for j in range(size)])
-    matrix, right = whole[:, :size], whole[:, size:]
-    for j in reversed(range(size)):
-        right = put(right, (right[j] / matrix[j, j][None])[None], (j, 0, 0))
-        if j:
-            right = put(right, right[:j] - matrix[:j, j][:, None] * right[j][None], (0, 0, 0))
-    return right, positive
+@functools.cache
+def _alike(bend: Matrix, d: int) -> Matrix | None:
+    """C if ∇²v = C ⊗ I, which is to say that it is the same along all d axes."""
+    block = np.array(bend)[::d, ::d]
+    return tuple(map(tuple, block)) if np.array_equal(np.kron(block, np.eye(d)), bend) else None
 
 
-def _looped(whole: Array, size: int) -> tuple[Array, Array]:
-    """Gauss and Jordan, without exchanges, which a positive definite matrix does not need."""
-
-    def eliminate(j: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
-        whole, positive = at
-        pivot = whole[j, j]
-        row = whole[j] / pivot[None]
-        factor = jnp.where(jnp.arange(size)[:, None] == j, 0.0, whole[:, j])
-        return (whole - factor[:, None] * row[None]).at[j].set(row), positive & (pivot > 0)
-
-    whole, positive = jax.lax.fori_loop(0, size, eliminate, (whole, jnp.ones(whole.shape[-1], bool)))
-    return whole[:, size:], positive
+def _block(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
+    """(n, n) C on all rows."""
+    block = _alike(bend, d)
+    assert block is not None
+    return _whole(block, slots, n, 1)

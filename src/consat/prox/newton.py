@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.prox.lanes import Expanded, Lanes, add_up, dot, solve_symmetric
+from consat.numerics import add_up
+from consat.prox.hessians import dot
+from consat.prox.lanes import Expanded, Lanes
 
 MOST_ITERATIONS = 200
 SHARPEN = 4.0
@@ -68,12 +70,12 @@ class _Ahead(NamedTuple):
 
     def to(self, change: Array) -> Array:
         """(N, A) the step in y for a change of σ."""
-        return self.descend + self.follow * jnp.where(change < 0, jnp.expm1(change), change)[None]
+        return self.descend + self.follow * jnp.where(change < 0, jnp.exp(change) - 1.0, change)[None]
 
 
 class _Here(NamedTuple):
-    """Where solvers stand: L to second order, its diagonal, what σ cannot exceed, σ and e^σ, the two forces of the first equation, its
-    matrix, Newton's step, and whether y is settled for this σ to a fraction of what the second equation lacks."""
+    """Where solvers stand: L to second order, its diagonal, what σ cannot exceed, σ and e^σ, the two forces of the first equation,
+    Newton's step and decrement, and whether y is settled for this σ to a fraction of what the second equation lacks."""
 
     model: Expanded
     diagonal: Array
@@ -82,8 +84,8 @@ class _Here(NamedTuple):
     multiplier: Array
     pull: Array
     push: Array
-    matrix: Array
     ahead: _Ahead
+    decrement: Array
     near: Array
 
     def wanted(self, drop: Array) -> Array:
@@ -91,7 +93,7 @@ class _Here(NamedTuple):
         model is good for."""
         gap, slope = self.model.level - self.sigma, self.model.slope
         left, reach = gap + drop, jnp.maximum(-dot(slope, self.ahead.follow), 0.0)
-        most = jnp.minimum(left, jnp.log1p(jnp.maximum(left, 0.0) / (reach + jnp.finfo(left.dtype).tiny)))
+        most = jnp.minimum(left, jnp.log(1.0 + jnp.maximum(left, 0.0) / (reach + jnp.finfo(left.dtype).tiny)))
         return self.sigma + jnp.minimum(left / (1.0 + reach), jnp.maximum(LONGEST_STEP, most))
 
 
@@ -219,7 +221,7 @@ class _Task(NamedTuple):
         last = here.near & (at.sharpness >= 1.0)
         sigma = jnp.where(last, wanted, here.sigma)
         y = at.y + here.ahead.to(sigma - here.sigma)
-        moves = ~at.done & jnp.isfinite(add_up(y))
+        moves = ~at.done & jnp.isfinite(here.decrement)
         return at._replace(
             y=jnp.where(moves[None], y, at.y),
             sigma=jnp.where(at.done, at.sigma, sigma),
@@ -230,38 +232,26 @@ class _Task(NamedTuple):
     def look(self, at: _Search) -> _Here:
         """What there is to know where solvers stand."""
         model = self.lanes.expand(at.y.reshape(*self.shape, -1), at.sharpness)
-        diagonal = jnp.stack([model.bend[i, i] for i in range(len(at.y))])
+        diagonal = model.bend.diagonal()
         mean = add_up(jnp.abs(diagonal)) / len(at.y)
         ceiling = jnp.log(STRONGEST * (add_up(self.kappa) / len(at.y)) / (mean + jnp.finfo(at.y.dtype).tiny))
         sigma = jnp.minimum(at.sigma, ceiling)
         multiplier = jnp.exp(sigma)
         pull, push = self.kappa * (at.y - self.v), multiplier[None] * model.slope
-        matrix, ahead = self.ahead(model, multiplier, pull + push, push)
+        found = model.bend.solve(self.kappa, multiplier, jnp.stack([-(pull + push), -push], axis=1))
+        ahead = _Ahead(found[:, 0], found[:, 1])
         gap = model.level - sigma
-        near = -dot(pull + push, ahead.descend) <= 0.2 * multiplier * jnp.maximum(1.0, 0.3 * jnp.abs(gap))
-        return _Here(model, diagonal, ceiling, sigma, multiplier, pull, push, matrix, ahead, near)
+        decrement = -dot(pull + push, ahead.descend)
+        bent = decrement
+        if self.precision.tolerance is None:  # where one step is to be enough, count only how L bends along it: κ is quadratic anyway
+            bent = jnp.abs(decrement - dot(self.kappa, ahead.descend**2))
+        near = bent <= 0.2 * multiplier * jnp.maximum(1.0, 0.3 * jnp.abs(gap))
+        return _Here(model, diagonal, ceiling, sigma, multiplier, pull, push, ahead, decrement, near)
 
     def stiffness(self, here: _Here) -> Array:
         """(n, A) the mean diagonal of ∇²f over the coordinates of each row."""
         bent = jnp.abs(here.diagonal + here.model.slope**2).reshape(*self.shape, -1)
         return here.multiplier[None] * (add_up(jnp.moveaxis(bent, 1, 0)) / self.shape[1])
-
-    def ahead(self, model: Expanded, multiplier: Array, residual: Array, push: Array) -> tuple[Array, _Ahead]:
-        """The matrix of the first equation, (N, N, A), and Newton's step."""
-        kappa = jnp.eye(len(self.v))[:, :, None] * self.kappa[None]
-        matrix, right = kappa + multiplier[None, None] * model.bend, jnp.stack([-residual, -push], axis=1)
-        found, positive = solve_symmetric(matrix, right)
-        if not self.lanes.batch.convex:
-
-            def mended() -> Array:
-                if model.safe is not None:
-                    return solve_symmetric(kappa + multiplier[None, None] * model.safe, right)[0]
-                values, vectors = jnp.linalg.eigh(jnp.moveaxis(matrix, -1, 0))
-                values = jnp.maximum(jnp.abs(values), jnp.min(self.kappa, axis=0)[:, None])
-                return jnp.einsum("aij,aj,akj,kra->ira", vectors, 1.0 / values, vectors, right)
-
-            found = jnp.where(positive[None, None], found, jax.lax.cond(jnp.all(positive), lambda: found, mended))
-        return matrix, _Ahead(found[:, 0], found[:, 1])
 
     def search(self, at: _Search, multiplier: Array, descend: Array) -> Array:
         """Where along a step the function whose gradient the first equation is, is least."""
@@ -281,7 +271,7 @@ class _Task(NamedTuple):
         residual, gap = pull + push, here.model.level - here.sigma
         eps, tolerance = 8 * jnp.finfo(at.y.dtype).eps, self.precision.tolerance or 0.0
         rounding = eps * (jnp.abs(at.y) + jnp.abs(self.v))
-        blur = add_up(jnp.abs(jnp.moveaxis(here.matrix, 1, 0)) * rounding[:, None])
+        blur = self.kappa * rounding + here.multiplier[None] * here.model.bend.absolute(rounding)
         terms = jnp.sqrt(dot(pull, pull)) + jnp.sqrt(dot(push, push))
         settled = jnp.sqrt(dot(residual, residual)) <= tolerance * terms + jnp.sqrt(dot(blur, blur))
         return settled, jnp.abs(gap) <= tolerance + eps * jnp.abs(at.sigma) + dot(jnp.abs(slope), rounding)

@@ -14,7 +14,7 @@ from jax import Array
 from consat import prox
 from consat.estimates import Estimates
 from consat.graphs import hops
-from consat.numerics import Groups
+from consat.numerics import Groups, pick
 from consat.objective import Nu, Objective
 from consat.protocols import Rounds, agreement
 from consat.scale import Region, Scale
@@ -72,7 +72,7 @@ class Ends:
 
     def across(self, links: Array) -> Array:
         """(E, …) → (E, …): what stands at the other ends."""
-        return self._in_blocks(lambda blocks: blocks[self.other], links)
+        return self._in_blocks(lambda blocks: pick(blocks, self.other), links)
 
     def _in_blocks(self, function: Callable[[Array], Array], values: Array) -> Array:
         if self.block == 1:
@@ -275,7 +275,7 @@ def hear(protocol: Rounds, world: World, now: Now, spoken: Spoken) -> tuple[Now,
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
     state = protocol.hear(spoken.state, jax.tree.map(ends.across, spoken.message), arrived, everyone)
     ages = agreement.hear(spoken.ages, ends.across(spoken.told), arrived)
-    body = _moved(now.body, state.x[world.own], world.reach)
+    body = _moved(now.body, pick(state.x, world.own), world.reach)
     return Now(state, ages, body, spoken.key), jnp.all(agreement.known(ages, everyone) > 0)
 
 
