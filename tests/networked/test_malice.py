@@ -67,9 +67,12 @@ PENALTY, AGE, EPOCH = slice(-3, -2), slice(-2, -1), slice(-1, None)
 POISON = {
     "x = ∞": numbers(math.inf),
     "x = 1e300": numbers(1e300),
-    "ln ρ = ∞": numbers(math.inf, PENALTY),
-    "ln ρ = 1e99": numbers(1e99, PENALTY),
-    "ln ρ = −1e99": numbers(-1e99, PENALTY),
+    "ρ = ∞": numbers(math.inf, PENALTY),
+    "ρ = 1e99": numbers(1e99, PENALTY),
+    "ρ = 1e−99": numbers(1e-99, PENALTY),
+    "ρ = 0": numbers(0.0, PENALTY),
+    "ρ = −1e99": numbers(-1e99, PENALTY),
+    "ρ = −1": numbers(-1.0, PENALTY),
     "age = ∞": numbers(math.inf, AGE),
     "age = −1e99": numbers(-1e99, AGE),
     "everybody has left, the largest number": numbers(MOST - 1, EPOCH),
@@ -86,7 +89,7 @@ POISON = {
     "an early goodbye": field(kind=Kind.GOODBYE, arrays=()),
 }
 ROUNDS = {"round 1e15": round_(1e15), "round 1e300": round_(1e300), "round −1e300": round_(-1e300), "round 0": round_(0.0)}
-LIES = {"admm": {"x = 1e30": numbers(1e30, slice(0, 2)), "ln ρ = 20": numbers(20.0, PENALTY)}, "link": {"x = 10": numbers(10.0)}}
+LIES = {"admm": {"x = 1e30": numbers(1e30, slice(0, 2)), "ρ = e²⁰": numbers(math.exp(20.0), PENALTY)}, "link": {"x = 10": numbers(10.0)}}
 """Finite, so they are taken; forgotten in time. The flow does that at the pace of its slowest mode."""
 CASES = {
     "admm": [*POISON, *LIES["admm"]],
@@ -138,7 +141,7 @@ def test_refused_neighbours_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RoundCore, "largest", property(lambda self: np.full(self.width, np.inf), lambda *_: None), raising=False)
     team = rehearse(MANNERS["admm"])
     team.run(SETTLED)
-    forge(team, "a1", "a2", POISON["ln ρ = ∞"])
+    forge(team, "a1", "a2", POISON["ρ = ∞"])
     team.run(1.0)
     assert [(event["id"], event["peer"]) for event in team.events if event["event"] == "refused"] == [("a2", "a1")]
     assert off(team) < 1e-3

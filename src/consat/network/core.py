@@ -23,8 +23,9 @@ from consat.prox import Memory
 
 LARGEST: Final = 1e100
 """No number that agents send is larger, margins apart, as none in a scenario is: squares stay finite."""
-PENALTY: Final = 200.0
-"""No |ln ρ| is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes."""
+PENALTY: Final = 1e80
+"""No ρ is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes. The protocol
+itself does not listen to one that is too small."""
 
 
 class Moment(NamedTuple):
@@ -144,8 +145,8 @@ class RoundCore:
         self._begin, self._turn = _compiled()
         self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self._layout.sizes) + 1
-        # A single number is ln ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
-        single = PENALTY + 2.0 * abs(math.log(whole.length)) if protocol.name == "admm" else np.inf
+        # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
+        single = PENALTY / whole.length**2 if protocol.name == "admm" else np.inf
         self.largest = np.array([*(LARGEST if shape else single for shape, size in self._layout.each for _ in range(size)), LARGEST])
 
     def begin(self, first: np.ndarray) -> _Now:

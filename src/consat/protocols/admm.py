@@ -8,9 +8,9 @@ keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
 x_j − g_ji/ρ_ij is q_ji/ρ_ij of the paper where both ends hold the same penalty, and keeps the balance of forces while they don't, because
 a message that told of a change was lost: points alone would drift apart. It converges under random loss and wake-ups from any u: there is
 no invariant to lose. The penalty of a link is the geometric mean of what its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It
-begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, and fall so
-only once it knows that all are satisfied: by then the optimum is all that is left to find, and a soft penalty finds it soonest. A copy that
-no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force
+begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, faster while its own
+constraints are violated, and fall so only once it knows that all are satisfied: by then the optimum is all that is left to find, and a soft
+penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force
 ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i the step would have no minimum.
 
 The points begin where the team's places are, however far out the bodies start: any would do, and near ones are rounds away.
@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -35,9 +36,9 @@ class AdmmState(NamedTuple):
     Attributes:
         x: (rows, d) estimates.
         u: (links, d) the points of its links.
-        wish: (rows,) ln ρ_i.
-        heard: (links,) ln ρ_j, as last received.
-        penalty: (links,) ln ρ_ij in force.
+        wish: (rows,) ρ_i.
+        heard: (links,) ρ_j, as last received.
+        penalty: (links,) ρ_ij in force.
         memory: of its solver.
     """
 
@@ -59,8 +60,10 @@ class Admm:
         penalty: ρ at the start, in 1/length².
         share: of the stiffness, that ρ_i moves towards.
         least: of the penalty at the start, below which ρ_i does not fall: agents with room to spare have no stiffness to speak of.
-        rise: how much ln ρ_i may rise in a round.
-        fall: how much it may fall while a message crosses the team, once the agent knows that all are satisfied.
+        rise: by which part ρ_i may rise in a round, …
+        hurry: … and how many times that is added where f_i is 1 or more, as it is while constraints are violated: agents with separations can
+            turn about each other in a cycle, which a stiffer penalty of theirs breaks.
+        fall: by which part it may fall while a message crosses the team, once the agent knows that all are satisfied.
         horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
     """
 
@@ -70,6 +73,7 @@ class Admm:
     share: float = 0.3
     least: float = 1e-6
     rise: float = 0.005
+    hurry: float = 10.0
     fall: float = 0.2
     horizon: float = 50.0
     name = "admm"
@@ -95,13 +99,20 @@ class Admm:
         kappa, linked = links.sum(rho), links.degree > 0
         v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
         x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, wish), x, state.memory, sharper, above)
-        neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
         stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
-        goal = jnp.where(jnp.isnan(stiff), neighbours, jnp.maximum(stiff, self.least * self.penalty / solver.length**2))
-        since, across, horizon = solver.to_rows(known), max(solver.hops, 1), self.horizon * max(solver.hops, 1)
-        rise = self.rise / (1.0 + (round_ / horizon) ** 4)
-        fall = jnp.where((since > 0) & solver.convex, self.fall / across / (1.0 + (since / horizon) ** 4), 0.0)
-        wish = jnp.clip(goal, wish * (1.0 - fall), wish * (1.0 + rise))
+        unread = jnp.isnan(stiff)
+
+        def followed() -> Array:
+            neighbours = jnp.where(linked, links.sum(state.heard) / jnp.maximum(links.degree, 1.0), wish)
+            return jnp.where(unread, neighbours, stiff)
+
+        goal = jax.lax.cond(jnp.any(unread), followed, lambda: stiff)
+        least, across = self.least * self.penalty / solver.length**2, max(solver.hops, 1)
+        horizon = self.horizon * across
+        rise = self.rise * (1.0 + self.hurry * jnp.exp(jnp.minimum(memory.sigma, 0.0))) / (1.0 + (round_ / horizon) ** 4)
+        fall = jnp.where(known > 0, self.fall / across / (1.0 + (known / horizon) ** 4), 0.0)
+        lowest = wish * (1.0 - solver.to_rows(fall)) if solver.convex else wish
+        wish = jnp.clip(jnp.maximum(goal, least), lowest, wish * (1.0 + solver.to_rows(rise)))
         here = links.at(x)
         return AdmmState(x, u, wish, state.heard, rho, memory), (here, rho[:, None] * (u - here), links.at(wish))
 
@@ -110,4 +121,5 @@ class Admm:
         q = there - force * (1.0 / state.penalty)[:, None]
         a = self.relaxation if solver.convex else min(self.relaxation, self.cautious)
         u = jnp.where(arrived[:, None], (1 - a) * state.u + a * q, state.u)
-        return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))
+        honest = wish >= 0.5 * self.least * self.penalty / solver.length**2  # nobody's own falls as low
+        return state._replace(u=u, heard=jnp.where(arrived & honest, wish, state.heard))

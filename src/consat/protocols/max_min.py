@@ -51,7 +51,7 @@ class MaxMin:
     crossings: int = 6
     stages: int = 10
     rise: float = 2.0
-    admm: Admm = field(default=Admm(fall=0.8, least=1e-4))
+    admm: Admm = field(default=Admm(fall=0.8, least=1e-4, hurry=0.0))
     name = "max-min"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "admm": Admm.per, "heard": "agent", "level": "agent"}
 
