@@ -39,6 +39,7 @@ from consat.protocols import FLOWS, ROUNDS, State
 from consat.runs.preparation import first_estimates
 from consat.scale import automatic, scale
 from consat.simulate import kernel
+from consat.simulate.engine import CHUNK
 from consat.simulate.flows import Problem, rate
 
 TEAMS = ("convoy", "lattice", "swarm")
@@ -46,8 +47,8 @@ COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LINEAR = 3_000
 """Agents from which on the exponent is fitted: smaller teams solve every local step exactly."""
 MOST_ROUNDS = 150
-BLOCK = 4
-"""Rounds, or steps of the flow, that are timed together: a run has them in one program too."""
+BLOCK = CHUNK
+"""Rounds, or steps of the flow, that are timed together: a run has as many in one program."""
 BLOCKS = 7
 """Blocks timed; the median counts, as the machine may be busy with other things meanwhile."""
 STEP = 0.01

@@ -8,10 +8,11 @@ keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
 x_j − g_ji/ρ_ij is q_ji/ρ_ij of the paper where both ends hold the same penalty, and keeps the balance of forces while they don't, because
 a message that told of a change was lost: points alone would drift apart. It converges under random loss and wake-ups from any u: there is
 no invariant to lose. The penalty of a link is the geometric mean of what its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It
-begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, faster while its own
-constraints are violated, and fall so only once it knows that all are satisfied: by then the optimum is all that is left to find, and a soft
-penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is rescaled with it, so that the force
-ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i the step would have no minimum.
+begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, faster while its
+own constraints are violated, and fall so only once it knows that all are satisfied: by then the optimum is all that is left to find, and a
+soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is
+rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i
+the step would have no minimum.
 
 The points begin where the team's places are, however far out the bodies start: any would do, and near ones are rounds away.
 """
@@ -61,8 +62,8 @@ class Admm:
         share: of the stiffness, that ρ_i moves towards.
         least: of the penalty at the start, below which ρ_i does not fall: agents with room to spare have no stiffness to speak of.
         rise: by which part ρ_i may rise in a round, …
-        hurry: … and how many times that is added where f_i is 1 or more, as it is while constraints are violated: agents with separations can
-            turn about each other in a cycle, which a stiffer penalty of theirs breaks.
+        hurry: … and how many times that is added where f_i is 1 or more, as it is while constraints are violated: agents with separations
+            can turn about each other in a cycle, which a stiffer penalty of theirs breaks.
         fall: by which part it may fall while a message crosses the team, once the agent knows that all are satisfied.
         horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
     """

@@ -217,11 +217,15 @@ class _Task(NamedTuple):
         """A step of Newton in every lane that is not done, and the last of those that begin it within reach of the solution; y alone moves
         where they don't."""
         here = self.look(at)
-        wanted = jnp.minimum(here.wanted(dot(here.model.slope, here.ahead.descend)), here.ceiling)
-        last = here.near & (at.sharpness >= 1.0)
-        sigma = jnp.where(last, wanted, here.sigma)
+
+        def decide() -> tuple[Array, Array, Array]:
+            wanted = jnp.minimum(here.wanted(dot(here.model.slope, here.ahead.descend)), here.ceiling)
+            last = here.near & (at.sharpness >= 1.0)
+            return jnp.where(last, wanted, here.sigma), last, ~at.done & jnp.isfinite(here.decrement)
+
+        # a branch that is always taken, since its results are stored: fused, they would be computed again for every coordinate
+        sigma, last, moves = jax.lax.cond(jnp.any(~at.done), decide, lambda: (at.sigma, at.done, at.done))
         y = at.y + here.ahead.to(sigma - here.sigma)
-        moves = ~at.done & jnp.isfinite(here.decrement)
         return at._replace(
             y=jnp.where(moves[None], y, at.y),
             sigma=jnp.where(at.done, at.sigma, sigma),
