@@ -15,7 +15,8 @@ from consat.estimates import Estimates
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.prox import batches
-from consat.prox.hessians import LOOPED, UNROLLED, solve_symmetric
+from consat.prox.hessians import LOOPED, UNROLLED, Alike, Dense, solve_symmetric
+from consat.prox.lanes import spread
 
 EXACT = prox.Precision(1e-10)
 ONE_STEP = prox.Precision(None)
@@ -98,3 +99,34 @@ def test_small_systems_are_solved(size: int) -> None:
     np.testing.assert_array_equal(positive, definite)
     for k in np.flatnonzero(definite):  # condition numbers up to 1e3
         np.testing.assert_allclose(np.asarray(found)[..., k], np.linalg.solve(matrix[k], right[k]), rtol=1e-9, atol=1e-10)
+
+
+@float64
+@pytest.mark.parametrize("constraints", [1, 2, 4])
+def test_alike_is_its_matrix(constraints: int) -> None:
+    """B ⊗ I + Σ w a aᵀ, by blocks and directions, against the matrix written out."""
+    rows, d, lanes = 3, 2, 5
+    random = np.random.default_rng(constraints)
+    factor = random.normal(size=(rows, rows, lanes))
+    block = np.einsum("ija,kja->ika", factor, factor)
+    gradients, p = random.normal(size=(constraints, rows * d, lanes)), random.dirichlet(np.ones(constraints), lanes).T
+    mean, terms = spread([jnp.asarray(g) for g in gradients], jnp.asarray(p))
+    np.testing.assert_allclose(mean, np.einsum("ka,kna->na", p, gradients), atol=1e-14)
+    away = gradients - np.einsum("ka,kna->na", p, gradients)
+    whole = np.stack([np.kron(block[..., k], np.eye(d)) for k in range(lanes)], axis=-1) + np.einsum("ka,kna,kma->nma", p, away, away)
+    alike, dense = Alike(jnp.asarray(block), terms, d), Dense(jnp.asarray(whole), None, convex=True)
+    np.testing.assert_allclose(alike.diagonal(), dense.diagonal(), rtol=1e-12)
+    numbers = jnp.asarray(random.uniform(size=(rows * d, lanes)))
+    assert (np.asarray(alike.absolute(numbers)) >= np.asarray(dense.absolute(numbers)) * (1 - 1e-12)).all()
+    kappa = jnp.asarray(np.repeat(random.uniform(0.5, 2.0, (rows, lanes)), d, axis=0))
+    multiplier, right = jnp.asarray(random.uniform(0.1, 1e3, lanes)), jnp.asarray(random.normal(size=(rows * d, 2, lanes)))
+    np.testing.assert_allclose(alike.solve(kappa, multiplier, right), dense.solve(kappa, multiplier, right), rtol=1e-8, atol=1e-10)
+
+
+@float64
+def test_spread_of_weights_that_have_vanished() -> None:
+    """Of p = (0, 0, 1) there is no spread, and the mean is the third."""
+    gradients = [jnp.full((2, 1), value) for value in (1.0, 2.0, 5.0)]
+    mean, terms = spread(gradients, jnp.asarray([[0.0], [0.0], [1.0]]))
+    np.testing.assert_array_equal(mean, gradients[2])
+    np.testing.assert_array_equal(sum(weight for weight, _ in terms), 0.0)
