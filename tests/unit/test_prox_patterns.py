@@ -16,7 +16,7 @@ from consat.numerics import float64
 from consat.objective import Nu
 from consat.prox import batches
 from consat.prox.hessians import LOOPED, UNROLLED, Alike, Dense, solve_symmetric
-from consat.prox.lanes import spread
+from consat.prox.lanes import variance
 
 EXACT = prox.Precision(1e-10)
 ONE_STEP = prox.Precision(None)
@@ -110,7 +110,7 @@ def test_alike_is_its_matrix(constraints: int) -> None:
     factor = random.normal(size=(rows, rows, lanes))
     block = np.einsum("ija,kja->ika", factor, factor)
     gradients, p = random.normal(size=(constraints, rows * d, lanes)), random.dirichlet(np.ones(constraints), lanes).T
-    mean, terms = spread([jnp.asarray(g) for g in gradients], jnp.asarray(p))
+    mean, terms = variance([jnp.asarray(g) for g in gradients], jnp.asarray(p))
     np.testing.assert_allclose(mean, np.einsum("ka,kna->na", p, gradients), atol=1e-14)
     away = gradients - np.einsum("ka,kna->na", p, gradients)
     whole = np.stack([np.kron(block[..., k], np.eye(d)) for k in range(lanes)], axis=-1) + np.einsum("ka,kna,kma->nma", p, away, away)
@@ -124,9 +124,9 @@ def test_alike_is_its_matrix(constraints: int) -> None:
 
 
 @float64
-def test_spread_of_weights_that_have_vanished() -> None:
+def test_variance_of_weights_that_have_vanished() -> None:
     """Of p = (0, 0, 1) there is no spread, and the mean is the third."""
     gradients = [jnp.full((2, 1), value) for value in (1.0, 2.0, 5.0)]
-    mean, terms = spread(gradients, jnp.asarray([[0.0], [0.0], [1.0]]))
+    mean, terms = variance(gradients, jnp.asarray([[0.0], [0.0], [1.0]]))
     np.testing.assert_array_equal(mean, gradients[2])
     np.testing.assert_array_equal(sum(weight for weight, _ in terms), 0.0)

@@ -24,8 +24,8 @@ from consat.prox import Memory
 LARGEST: Final = 1e100
 """No number that agents send is larger, margins apart, as none in a scenario is: squares stay finite."""
 PENALTY: Final = 1e80
-"""No ρ is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes. The protocol
-itself does not listen to one that is too small."""
+"""No ρ is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes. One that is
+not positive makes the state NaN, which `consat.network.guard` does not let happen."""
 
 
 class Moment(NamedTuple):

@@ -122,5 +122,4 @@ class Admm:
         q = there - force * (1.0 / state.penalty)[:, None]
         a = self.relaxation if solver.convex else min(self.relaxation, self.cautious)
         u = jnp.where(arrived[:, None], (1 - a) * state.u + a * q, state.u)
-        honest = wish >= 0.5 * self.least * self.penalty / solver.length**2  # nobody's own falls as low
-        return state._replace(u=u, heard=jnp.where(arrived & honest, wish, state.heard))
+        return state._replace(u=u, heard=jnp.where(arrived, wish, state.heard))

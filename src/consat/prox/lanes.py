@@ -94,7 +94,7 @@ class Lanes:
                 places.append((form.bend, slots))
                 weights.append(1.0 if kind.weight is None else kind.weight[k])
         level, p = self._soft(jnp.concatenate(values), sharpness)
-        mean, away = spread(gradients, p)
+        mean, away = variance(gradients, p)
         directions = [(self.nu.beta * self.nu.alpha * sharpness * share, a) for share, a in away]
 
         def constant(whole: Callable[..., np.ndarray]) -> Array:
@@ -176,7 +176,7 @@ def _placed(slope: Array, slots: tuple[int, ...], n: int) -> Array:
     return jnp.concatenate([slope[slots.index(row)] if row in slots else nothing for row in range(n)])
 
 
-def spread(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+def variance(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array, Array]]]:
     """The mean ḡ = Σ_k p_k g_k, and Σ_k p_k (g_k − ḡ)(g_k − ḡ)ᵀ as Σ w a aᵀ with one term less (West's recurrence), (w, a) each."""
     mean, total, terms = gradients[0], p[0], []
     for g, share in zip(gradients[1:], p[1:], strict=True):
