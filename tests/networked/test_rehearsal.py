@@ -89,7 +89,7 @@ def test_lockstep_survives_a_crash_without_memory() -> None:
 
 def test_heals_after_a_partition(mode: str) -> None:
     team = rehearse(MODES[mode])
-    team.run(0.2)
+    team.run(0.1)
     team.air.partition({"a1"}, {"a2", "a3"})
     team.run(PATIENCE[mode])
     assert off(team) > 0.05  # what follows is not there already
