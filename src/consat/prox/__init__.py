@@ -7,7 +7,7 @@ near it, so e^{L} is replaced by its conjugate: with ln of the multiplier, σ, a
 
     κ (y − v) + e^σ ∇L(y) = 0,        L(y) − σ = 0.
 
-`batches` sorts the agents, `lanes` computes L and its derivatives for many at once, `hessians` solves the linear systems, `newton` the step.
+`batches` sorts the agents, `lanes` computes L and its derivatives for many at once, `hessians` solves linear systems, `newton` the step.
 """
 
 from __future__ import annotations
