@@ -119,7 +119,7 @@ def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_ot
     """The checker refuses infinite penalties before; whatever it may overlook, the state stays finite."""
     core = core_of(parts()["a2"], Manner("admm"))
     state = core.begin(core.part.first)
-    inbox = np.random.default_rng(0).normal(size=(len(core.ends), core.width))
+    inbox = np.abs(np.random.default_rng(0).normal(size=(len(core.ends), core.width)))  # penalties are positive
     arrived = np.ones(len(core.ends), dtype=bool)
     moment = Moment(0.0, 0.01, np.zeros(len(arrived)), arrived)
     good = guard.turn(core, state, inbox, arrived, moment)
