@@ -43,7 +43,7 @@ class MaxMin:
         stage: rounds at each ν, and …
         crossings: … as many more as a message needs to cross the team so many times.
         stages: how often ν doubles.
-        rise: how much ln ρ_i may rise in a stage.
+        rise: by which part ρ_i may rise in a stage, an equal share in each of its rounds.
         admm: how each stage is solved.
     """
 

@@ -31,7 +31,7 @@ class Expanded(NamedTuple):
     Attributes:
         level: (A,) L.
         slope: (N, A) ∇L, N = n·d.
-        bend: (N, N, A) ∇²L.
+        bend: ∇²L.
     """
 
     level: Array
@@ -187,14 +187,10 @@ def variance(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array,
     return mean, terms
 
 
-def _placement(slots: tuple[int, ...], d: int) -> np.ndarray:
-    return (np.array(slots)[:, None] * d + np.arange(d)).ravel()
-
-
 @functools.cache
 def _whole(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
     """(N, N) ∇²v on all rows."""
-    index, whole = _placement(slots, d), np.zeros((n * d, n * d))
+    index, whole = (np.array(slots)[:, None] * d + np.arange(d)).ravel(), np.zeros((n * d, n * d))
     whole[np.ix_(index, index)] = bend
     return whole
 
