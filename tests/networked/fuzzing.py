@@ -78,7 +78,7 @@ def _double(data: bytes) -> float:
 
 def second_opinion(payload: bytes) -> Read | None:
     """What the message says, or None if it must not be accepted, whatever came before."""
-    if len(payload) < 72 or payload[:5] != b"csat\x01" or payload[7] or payload[8:16] != PROBLEM:
+    if len(payload) < 72 or payload[:5] != b"csat\x02" or payload[7] or payload[8:16] != PROBLEM:
         return None
     if crc(payload[:-4]) != _integer(payload[-4:]):
         return None

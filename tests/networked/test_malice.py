@@ -43,7 +43,7 @@ def forge(team: Rehearsal, source: str, victim: str, change: Callable[[Message],
 
 
 def numbers(value: float, columns: slice = slice(0, -1)) -> Callable[[Message], Message]:
-    """Every number of the state replaced; the last column tells who is there, the one before it the age."""
+    """Every number of the state replaced; the last column tells who is there, those before it of bodies: place, staleness, age."""
 
     def change(message: Message) -> Message:
         arrays = [array.copy() for array in message.arrays]
@@ -63,7 +63,7 @@ def round_(value: float) -> Callable[[Message], Message]:
     return lambda message: dataclasses.replace(message, arrays=(*message.arrays[:2], np.array([value])))
 
 
-PENALTY, AGE, EPOCH = slice(-3, -2), slice(-2, -1), slice(-1, None)
+PENALTY, PACE, PLACE, STALE, AGE, EPOCH = (slice(*ends) for ends in ((-7, -6), (-6, -5), (-5, -3), (-3, -2), (-2, -1), (-1, None)))
 POISON = {
     "x = ∞": numbers(math.inf),
     "x = 1e300": numbers(1e300),
@@ -73,8 +73,16 @@ POISON = {
     "ρ = 0": numbers(0.0, PENALTY),
     "ρ = −1e99": numbers(-1e99, PENALTY),
     "ρ = −1": numbers(-1.0, PENALTY),
+    "estimates satisfied for ever": numbers(math.inf, PACE),
+    "estimates satisfied for less than no time": numbers(-1e99, PACE),
     "age = ∞": numbers(math.inf, AGE),
     "age = −1e99": numbers(-1e99, AGE),
+    "age = 1e99": numbers(1e99, AGE),
+    "a body at ∞": numbers(math.inf, PLACE),
+    "a body at 1e99": numbers(1e99, PLACE),
+    "word of a body from the future": numbers(-1e99, STALE),
+    "word of a body from the far past": numbers(1e99, STALE),
+    "word of a body from no time": numbers(math.inf, STALE),
     "everybody has left, the largest number": numbers(MOST - 1, EPOCH),
     "everybody has left": numbers(1.0, EPOCH),
     "everybody has left a fraction of times": numbers(1.5, EPOCH),
@@ -121,7 +129,7 @@ def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_ot
     state = core.begin(core.part.first)
     inbox = np.abs(np.random.default_rng(0).normal(size=(len(core.ends), core.width)))  # penalties are positive
     arrived = np.ones(len(core.ends), dtype=bool)
-    moment = Moment(0.0, 0.01, np.zeros(len(arrived)), arrived)
+    moment = Moment(0.0, 0.01, np.zeros(len(arrived)), arrived, np.zeros(2))
     good = guard.turn(core, state, inbox, arrived, moment)
     assert good.refused == ()
     np.testing.assert_array_equal(good.look.x, core.turn(state, inbox, arrived, moment)[2].x)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from consat.errors import InvalidSettings, NetworkError
 from consat.network.board import table
-from consat.network.body import MeasuredBody, SimulatedBody
+from consat.network.body import CONFIRMED, MeasuredBody, Measurement, SimulatedBody
 from consat.network.environment import prepare
 from consat.network.gather import Observer
 from consat.network.membership import Membership
@@ -154,10 +154,65 @@ def test_a_simulated_body_moves_straight_and_no_faster_than_allowed() -> None:
 def test_a_measured_body_stands_still_until_it_is_measured() -> None:
     body = MeasuredBody(speed=1.0, lag=0.5)
     assert body.follow(np.ones(2), 0.0).tolist() == [0.0, 0.0]
-    body.measure(np.array([1.0, 0.9]))
+    assert body.measure(Measurement(np.array([1.0, 0.9]), 1.0)) is None
     np.testing.assert_allclose(body.follow(np.ones(2), 1.0), [0.0, 0.2])  # 0.1 in 0.5 s
-    body.measure(np.array([1.0, -9.0]))
+    assert body.measure(Measurement(np.array([1.0, -0.5]), 2.0)) is None
     np.testing.assert_allclose(body.follow(np.ones(2), 2.0), [0.0, 1.0])
+
+
+def sightings(body: MeasuredBody, *seen: tuple[float, float] | tuple[float, float, float]) -> list[bool]:
+    """Which measurements (time, x) or (time, x, stamp) are believed."""
+    return [body.measure(Measurement(np.array([x, 0.0]), time, *stamp)) is None for time, x, *stamp in seen]
+
+
+def at(body: MeasuredBody) -> float:
+    position = body.position()
+    assert position is not None
+    return float(position[0])
+
+
+def test_a_measurement_farther_than_the_body_moves_is_not_believed() -> None:
+    body = MeasuredBody(speed=1.0, timeout=0.5)
+    assert sightings(body, (0.0, 0.0), (0.1, 0.59), (0.2, 1.2), (0.3, 50.0)) == [True, True, False, False]
+    assert at(body) == 0.59
+    assert "it is 49.4 from the last one, 0.3 s ago, but the body moves by 1 a second" in str(
+        body.measure(Measurement(np.array([50.0, 0]), 0.4))
+    )
+    assert sightings(body, (0.5, 0.7)) == [True]
+    assert sightings(MeasuredBody(), (0.0, 0.0), (0.1, 1e9)) == [True, True], "without a speed no distance is too far"
+
+
+def test_a_robot_that_was_moved_is_found_again() -> None:
+    body = MeasuredBody(speed=1.0)
+    assert sightings(body, (0.0, 0.0), *((0.1 * k, 9.0 + 0.01 * k) for k in range(1, CONFIRMED + 1))) == [True, *[False] * 4, True]
+    assert at(body) == 9.05
+    wild = [(1.0 + 0.1 * k, 100.0 * (-1) ** k) for k in range(20)]
+    assert not any(sightings(body, *wild)), "which do not agree with each other"
+    between = [(3.0 + 0.1 * k, 9.05 if k % CONFIRMED == 0 else 50.0) for k in range(40)]
+    assert sightings(body, *between) == [k % CONFIRMED == 0 for k in range(40)], "the last good one is confirmed in between"
+
+
+def test_stamps_must_rise_until_the_sensor_starts_anew() -> None:
+    body = MeasuredBody(speed=1.0, timeout=0.5)
+    assert sightings(body, (0.0, 0.0, 10.0), (0.1, 0.1, 9.0), (0.2, 0.2, 10.0), (0.3, 0.3, 10.5)) == [True, False, False, True]
+    assert at(body) == 0.3
+    burst = [(0.4 + 0.001 * k, 0.1, 1.0 + k) for k in range(8)]
+    assert not any(sightings(body, *burst)), "what was held up on the way, and comes now"
+    assert sightings(body, (0.5, 0.4), (0.6, 0.5, 10.2), (0.7, 0.5, 11.0)) == [True, False, True], "one without a stamp changes nothing"
+    anew = [(1.5 + 0.1 * k, 0.5, 1.0 + k) for k in range(CONFIRMED)]
+    assert sightings(body, *anew) == [False] * (CONFIRMED - 1) + [True]
+
+
+def test_a_body_that_is_not_measured_any_more_stands() -> None:
+    body = MeasuredBody(speed=1.0, timeout=0.5)
+    assert not body.sensed(0.0)
+    sightings(body, (0.0, 0.0), (0.1, 90.0))
+    assert body.sensed(0.5)
+    assert not body.sensed(0.51), "what is not believed is no measurement"
+    assert body.follow(np.array([5.0, 0.0]), 0.5).tolist() == [1.0, 0.0]
+    assert body.follow(np.array([5.0, 0.0]), 0.51).tolist() == [0.0, 0.0]
+    sightings(body, (0.6, 0.2))
+    assert body.follow(np.array([5.0, 0.0]), 0.6).tolist() == [1.0, 0.0]
 
 
 # -- modes and environment ---------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.network.core import Kept, Look, Moment
+from consat.network.core import Embodied, Kept, Moment
 from consat.network.link_core import LinkCore, LinkState
 from consat.network.modes import Manner, Runner
 from consat.network.paced import Paced
@@ -264,14 +264,14 @@ def test_a_body_keeps_to_its_speed_limit() -> None:
 class Naive(LinkCore):
     """The paper's flow sampled naively: each end of a link integrates its own idea of the difference, ż = k1 k2 Σ (x − x̂)."""
 
-    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, Look]:
+    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, np.ndarray]:
         kept = state.force
-        after, outbox, look = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
+        after, outbox, x = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
         integral = kept + self.k1 * self.k2 * moment.elapsed * (self.solver.links.at(after.x) - after.there)
         state = after._replace(force=integral, theirs=-integral, valid=jnp.zeros_like(after.valid))
         outbox = outbox.copy()
-        outbox[:, -2] = 0.0  # says nothing of its integral
-        return state, outbox, look
+        outbox[:, -1] = 0.0  # says nothing of its integral
+        return state, outbox, x
 
     def among(self, gone: Any) -> "Naive":
         return Naive(self.whole, self.k1, self.k2, gone)
@@ -279,7 +279,7 @@ class Naive(LinkCore):
 
 def sampled(core: type[LinkCore]) -> Any:
     def build(part: Any, manner: Manner, transport: Any, **options: Any) -> Runner:
-        made = core(part, 1.0, 1.0)
+        made = Embodied(core(part, 1.0, 1.0))
         return Paced(Station(part, made, "link", transport, **options), {"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
 
     return build

@@ -44,7 +44,7 @@ def checker(expected: Mapping[str, Any] = EXPECTED, **options: Any) -> Checker:
 def test_bytes_are_as_documented() -> None:
     """Written down by hand: whoever changes the format must change the version."""
     body = (
-        b"csat\x01\x02\x02\x00problem1"
+        b"csat\x02\x02\x02\x00problem1"
         + struct.pack("<QQQ", 3, 2**40, 9)
         + struct.pack("<ddd", 1.5, 0.25, 5.0)
         + b"\x02\x00\x03\x00a1\xc3\xa4x"
@@ -113,7 +113,8 @@ BAD = {
     "a megabyte": (sealed(encode(message())[:-4] + bytes(10**6)), Reason.SIZE),
     "a pickle": (pickle.dumps({"x": list(range(99))})[:120], Reason.MAGIC),
     "another program's": (patched(0, b"JSON"), Reason.MAGIC),
-    "version 2": (patched(4, b"\x02"), Reason.VERSION),
+    "version 1, which told nothing of bodies": (patched(4, b"\x01"), Reason.VERSION),
+    "version 3": (patched(4, b"\x03"), Reason.VERSION),
     "a flipped bit": (encode(message())[:-5] + b"\x41" + encode(message())[-4:], Reason.CHECKSUM),
     "a reserved byte": (patched(7, b"\x01"), Reason.HEADER),
     "a stranger": (encode(message(source="a9")), Reason.SOURCE),

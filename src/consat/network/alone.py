@@ -56,6 +56,9 @@ class OwnLinks:
     def sum(self, links: Array) -> Array:
         return self.groups.sum(links)
 
+    def least(self, links: Array) -> Array:
+        return -self.groups.max(-links)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)

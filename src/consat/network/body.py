@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
+
+SLACK: Final = 0.5
+"""A measurement is believed where the body could be by now, and as far beyond as it moves in so long, s."""
+CONFIRMED: Final = 5
+"""So many measurements on end that agree with each other, but not with the last good one, are believed: the body was moved."""
 
 
 class Body(Protocol):
     """Sensor and actuator."""
 
     def position(self) -> np.ndarray | None:
-        """(d,) where it is, None before the first measurement."""
+        """(d,) where it is, as far as is known; None before the first measurement."""
+        ...
+
+    def sensed(self, now: float) -> bool:
+        """Whether its position is known as of now."""
         ...
 
     def follow(self, target: np.ndarray, now: float) -> np.ndarray:
@@ -41,6 +50,9 @@ class SimulatedBody:
     def position(self) -> np.ndarray:
         return self._position
 
+    def sensed(self, now: float) -> bool:
+        return True
+
     def follow(self, target: np.ndarray, now: float) -> np.ndarray:
         elapsed, self._last = (0.0 if self._last is None else now - self._last), now
         if not np.isfinite(self._speed):
@@ -54,27 +66,75 @@ class SimulatedBody:
         return velocity
 
 
+class Measurement(NamedTuple):
+    """What a sensor said.
+
+    Attributes:
+        position: (d,) finite.
+        time: when it came, by the agent's clock, s.
+        stamp: the sensor's own number for it, which rises; None if it gives none.
+    """
+
+    position: np.ndarray
+    time: float
+    stamp: float | None = None
+
+
 class MeasuredBody:
     """A real one: its position is measured from outside, and what `follow` returns is commanded to it.
 
+    A measurement that cannot follow the last good one, by its stamp or by its distance, is not believed. After `CONFIRMED` on end that
+    can follow each other the body was moved, and they are. Stamps turn back only after the sensor was silent for `timeout`: it was
+    started anew.
+
     Args:
-        speed: the most that is commanded, length/s.
+        speed: the most that is commanded, length/s. Without one any distance is believed.
+        timeout: a body not measured for so long, s, is not known to be anywhere, and stands.
         lag: the time in which it would cover the distance, were there no limit, s.
     """
 
-    def __init__(self, speed: float = np.inf, lag: float = 0.5) -> None:
-        self._speed = speed
-        self._lag = lag
-        self._position: np.ndarray | None = None
+    def __init__(self, speed: float = np.inf, timeout: float = np.inf, lag: float = 0.5) -> None:
+        self._speed, self._timeout, self._lag = speed, timeout, lag
+        self._good: Measurement | None = None
+        self._rival: Measurement | None = None
+        self._agreeing = 0
 
-    def measure(self, position: np.ndarray) -> None:
-        """What the sensor says."""
-        self._position = position
+    def measure(self, new: Measurement) -> str | None:
+        """Take in what the sensor says; why not, if it is not believed."""
+        good = self._good
+        why = None if good is None else self._doubt(good, new)
+        if good is not None and why is not None:
+            agrees = self._rival is not None and self._doubt(self._rival, new) is None
+            self._agreeing = self._agreeing + 1 if agrees else 1
+            self._rival = new
+            early = _turns_back(good, new) and self.sensed(new.time)
+            if self._agreeing < CONFIRMED or early:
+                return why
+        elif good is not None and new.stamp is None:
+            new = new._replace(stamp=good.stamp)
+        self._good, self._rival, self._agreeing = new, None, 0
+        return None
+
+    def _doubt(self, last: Measurement, new: Measurement) -> str | None:
+        """Why a measurement cannot follow another one, if it cannot."""
+        if _turns_back(last, new):
+            return f"its stamp is {new.stamp:.17g}, but must be above {last.stamp:.17g}, the last one"
+        distance, elapsed = float(np.linalg.norm(new.position - last.position)), max(new.time - last.time, 0.0)
+        if distance > self._speed * (elapsed + SLACK):
+            return f"it is {distance:.3g} from the last one, {elapsed:.2g} s ago, but the body moves by {self._speed:.3g} a second"
+        return None
 
     def position(self) -> np.ndarray | None:
-        return self._position
+        return None if self._good is None else self._good.position
+
+    def sensed(self, now: float) -> bool:
+        return self._good is not None and now - self._good.time <= self._timeout
 
     def follow(self, target: np.ndarray, now: float) -> np.ndarray:
-        if self._position is None:
+        if self._good is None or not self.sensed(now):
             return np.zeros_like(target)
-        return limited((target - self._position) / self._lag, self._speed)
+        return limited((target - self._good.position) / self._lag, self._speed)
+
+
+def _turns_back(last: Measurement, new: Measurement) -> bool:
+    return last.stamp is not None and new.stamp is not None and new.stamp <= last.stamp

@@ -118,6 +118,10 @@ def split(
 @pace_option
 @speed_option
 @click.option("--sensor", type=click.Choice(["simulated", "stdin"]), default="simulated", show_default=True, help="Whence positions come.")
+@click.option(
+    "--sensor-timeout", type=click.FloatRange(min=0, min_open=True), default=0.5, show_default=True, metavar="SECONDS",
+    help="Without a measurement for so long, command to stand.",
+)  # fmt: skip
 @click.option("--position", type=_Position(), help="Where a simulated body is, e.g. 0.5,-1; the scenario's start if not given.")
 @rounds_option
 @until_option

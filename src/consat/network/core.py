@@ -1,6 +1,7 @@
-"""What an agent computes, apart from how its messages travel: a protocol, compiled for its own part.
+"""What an agent computes, apart from how its messages travel: a protocol, compiled for its own part, and what it knows of bodies.
 
 A core turns what has come since its last turn into its next state and what it says next: one row of numbers for each end of a link.
+`Embodied` adds to any core the agreement about bodies.
 """
 
 from __future__ import annotations
@@ -36,12 +37,14 @@ class Moment(NamedTuple):
         elapsed: since the last turn, s.
         delay: (E,) how long messages take over each end, s.
         fresh: (E,) whether the neighbour at the other end was heard lately.
+        body: (d,) where the agent's body is, NaN where that is not known.
     """
 
     round: float
     elapsed: float
     delay: np.ndarray
     fresh: np.ndarray
+    body: np.ndarray
 
 
 class Look(NamedTuple):
@@ -49,12 +52,14 @@ class Look(NamedTuple):
 
     Attributes:
         x: (rows, d) its estimates.
-        margin: ᾱ_i at them, +∞ without constraints.
-        known: for how many turns it has known that all are satisfied.
+        bodies: (rows, d) where its own body is, and where it last heard that the others are.
+        heard: whether it has heard of all of them.
+        known: for how many turns it has known that all are satisfied, by their bodies.
     """
 
     x: np.ndarray
-    margin: float
+    bodies: np.ndarray
+    heard: bool
     known: float
 
 
@@ -81,12 +86,18 @@ class Core(Protocol):
         """(width,) the largest magnitude that each of them may have."""
         ...
 
+    @property
+    def solver(self) -> Alone:
+        """Of the part."""
+        ...
+
     def begin(self, first: np.ndarray) -> Any:
         """The state from first estimates, (rows, d)."""
         ...
 
-    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
-        """Hear what arrived, (E, width), where `arrived`, (E,); take a step; the next state, and what to say, (E, width)."""
+    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, np.ndarray]:
+        """Hear what arrived, (E, width), where `arrived`, (E,); take a step; the next state, what to say, (E, width), and the
+        estimates, (rows, d)."""
         ...
 
     def among(self, gone: Collection[str]) -> Core:
@@ -105,7 +116,7 @@ class Kept(NamedTuple):
     link: np.ndarray
 
     @classmethod
-    def of(cls, new: Core, old: Core) -> Kept:
+    def of(cls, new: Core | Embodied, old: Core | Embodied) -> Kept:
         rows = {agent: k for k, agent in enumerate(old.part.team.ids)}
         links = {end: k for k, end in enumerate(old.ends)}
         return cls(
@@ -134,7 +145,7 @@ class _Now(NamedTuple):
 
 
 class RoundCore:
-    """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement`."""
+    """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement` by which it paces itself."""
 
     def __init__(self, protocol: Rounds, whole: Part, gone: Collection[str] = ()) -> None:
         self.protocol = protocol
@@ -142,7 +153,7 @@ class RoundCore:
         self.part = whole.without(gone)
         self.ends = ends(self.part)
         self.solver = Alone.of(self.part)
-        self._begin, self._turn = _compiled()
+        self._begin, self._turn, *_ = _compiled()
         self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self._layout.sizes) + 1
         # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
@@ -152,11 +163,9 @@ class RoundCore:
     def begin(self, first: np.ndarray) -> _Now:
         return self._begin(self.protocol, self.solver, first)
 
-    def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, Look]:
-        now, outbox, x, margin, known = self._turn(
-            self.protocol, self._layout, self.solver, state, (inbox, arrived, moment.fresh), moment.round
-        )
-        return now, np.asarray(outbox), Look(np.asarray(x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
+    def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, np.ndarray]:
+        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived, moment.fresh), moment.round)
+        return now, np.asarray(outbox), np.asarray(now.state.x)
 
     def among(self, gone: Collection[str]) -> RoundCore:
         return RoundCore(self.protocol, self.whole, gone)
@@ -230,7 +239,7 @@ def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
 
 def _turn(
     protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], round_: Array
-) -> tuple[_Now, Array, Array, Array, Array]:
+) -> tuple[_Now, Array]:
     inbox, arrived, fresh = heard
     state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
     ages = known_of(agreement.hear(now.ages, inbox[:, -1], arrived), fresh)
@@ -240,7 +249,7 @@ def _turn(
         [*(leaf.reshape(len(inbox), size) for leaf, size in zip(jax.tree.leaves(message), layout.sizes, strict=True)), told[:, None]],
         axis=1,
     )
-    return _Now(state, ages), outbox, state.x, solver.margin(state.x), agreement.known(ages, solver)
+    return _Now(state, ages), outbox
 
 
 def known_of(ages: agreement.Ages, fresh: Array | np.ndarray) -> agreement.Ages:
@@ -248,9 +257,103 @@ def known_of(ages: agreement.Ages, fresh: Array | np.ndarray) -> agreement.Ages:
     return ages._replace(heard=jnp.where(fresh, ages.heard, 0.0))
 
 
+class EmbodiedState(NamedTuple):
+    """What an agent remembers.
+
+    Attributes:
+        core: the state of its core.
+        bodies: see `consat.protocols.agreement`.
+    """
+
+    core: Any
+    bodies: agreement.Bodies
+
+
+_PER_BODIES: Final[Mapping[str, Any]] = {"position": "row", "stale": "row", "ages": {"age": "agent", "heard": "link"}}
+
+
+class Embodied:
+    """Any core, with word of where the bodies are: d coordinates, for how many turns they have been on their way, and an age.
+
+    Args:
+        core: the protocol on the agent.
+    """
+
+    def __init__(self, core: Core) -> None:
+        self.core, self.part = core, core.part
+        self.ends: Sequence[tuple[str, str]] = core.ends
+        dimension = self.part.team.dimension
+        self.width = core.width + dimension + 2
+        self.largest = np.append(core.largest, np.full(dimension + 2, LARGEST))
+        self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
+
+    def begin(self, first: np.ndarray) -> EmbodiedState:
+        """The state from first estimates, (rows, d)."""
+        return EmbodiedState(self.core.begin(first), self._start(self.core.solver, first))
+
+    def turn(self, state: EmbodiedState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[EmbodiedState, np.ndarray, Look]:
+        """See `Core.turn`; and what the agent then sees of itself."""
+        inner, outbox, x = self.core.turn(state.core, inbox[:, : self.core.width], arrived, moment)
+        bodies, said, heard, known = self._agree(
+            self.core.solver, self._owners, state.bodies, (inbox[:, self.core.width :], arrived, moment.fresh), moment.body
+        )
+        look = Look(x, np.asarray(bodies.position), bool(np.asarray(heard)[0]), float(np.asarray(known)[0]))
+        return EmbodiedState(inner, bodies), np.concatenate([outbox, np.asarray(said)], axis=1), look
+
+    def margin(self, positions: np.ndarray) -> float:
+        """ᾱ_i, were the agents of the part at these positions, (rows, d); +∞ without constraints."""
+        return float(np.asarray(self._margin(self.core.solver, positions))[0])
+
+    def among(self, gone: Collection[str]) -> Embodied:
+        """The same when these agents are not there."""
+        return Embodied(self.core.among(gone))
+
+    def carry(self, other: Embodied, state: EmbodiedState, first: np.ndarray) -> EmbodiedState:
+        """See `Core.carry`. Where bodies are lives on; who is satisfied does not."""
+        fresh = self._start(self.core.solver, first)
+        bodies = Kept.of(self, other).merge(_PER_BODIES, state.bodies, fresh)._replace(ages=fresh.ages)
+        return EmbodiedState(self.core.carry(other.core, state.core, first), bodies)
+
+
+def owners_of(part: Part) -> agreement.Owners:
+    """Whose positions the agent of a part holds, and from whom it takes word of their bodies."""
+    place, pairs = {agent: row for row, agent in enumerate(part.team.ids)}, ends(part)
+    row = np.array([place[agent] for _, agent in pairs], dtype=np.int64)
+    direct = np.array([neighbour == agent for neighbour, agent in pairs], dtype=bool)
+    return agreement.Owners.of(np.array([place[part.me]]), row, direct, part.team.count)
+
+
+def _agree(
+    solver: Alone, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array
+) -> tuple[agreement.Bodies, Array, Array, Array]:
+    inbox, arrived, fresh = heard
+    bodies = agreement.hear_bodies(bodies, agreement.Word(inbox[:, :-2], inbox[:, -2], inbox[:, -1]), arrived, owners, solver)
+    bodies, word = agreement.speak_bodies(bodies._replace(ages=known_of(bodies.ages, fresh)), body[None], owners, solver)
+    said = jnp.concatenate([word.position, word.stale[:, None], word.age[:, None]], axis=1)
+    return bodies, said, agreement.all_heard(bodies, solver), agreement.known(bodies.ages, solver)
+
+
+class _Programs(NamedTuple):
+    begin: Callable[..., Any]
+    turn: Callable[..., Any]
+    start: Callable[..., Any]
+    agree: Callable[..., Any]
+    margin: Callable[..., Any]
+
+
 @functools.cache
-def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _compiled() -> _Programs:
     """Compiled once for all agents of the same shape."""
     options = quick_compilation()
-    begin = jax.jit(_begin, static_argnames=("protocol",), compiler_options=options)
-    return begin, jax.jit(_turn, static_argnames=("protocol", "layout"), compiler_options=options)
+
+    def start(solver: Alone, first: Array) -> agreement.Bodies:
+        return agreement.start_bodies(first, solver)
+
+    def margin(solver: Alone, positions: Array) -> Array:
+        return solver.margin(positions)
+
+    return _Programs(
+        jax.jit(_begin, static_argnames=("protocol",), compiler_options=options),
+        jax.jit(_turn, static_argnames=("protocol", "layout"), compiler_options=options),
+        *(jax.jit(function, compiler_options=options) for function in (start, _agree, margin)),
+    )

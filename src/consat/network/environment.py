@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Final
 
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LOG_LEVEL, _OF_JAX = "TF_CPP_MIN_LOG_LEVEL", "1"
+"""What XLA writes on stderr, and what JAX asks for where nobody does, which its subprocesses inherit."""
 ONE_THREAD: Final = "--xla_cpu_multi_thread_eigen=false"
 ROUND_EACH: Final = "--xla_cpu_max_isa=AVX"
 """Without fused multiply-add every product is rounded by itself, so that a result does not depend on what XLA computes beside it."""
@@ -42,5 +44,7 @@ def keep_compilations(environment: MutableMapping[str, str]) -> None:
     if "JAX_COMPILATION_CACHE_DIR" not in environment:
         home = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         environment["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
+    if environment.get(_LOG_LEVEL, _OF_JAX) == _OF_JAX:
+        environment[_LOG_LEVEL] = "3"  # XLA calls every program that it takes from there one of another machine, in 2 KiB on stderr
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

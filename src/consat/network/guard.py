@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from consat.network.core import Core, Look, Moment
+from consat.network.core import Embodied, Look, Moment
 
 
 class Turn(NamedTuple):
@@ -33,8 +33,8 @@ class Turn(NamedTuple):
     anew: bool = False
 
 
-def turn(core: Core, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> Turn:
-    """Take a turn, see `Core.turn`, without those neighbours whose messages spoil it."""
+def turn(core: Embodied, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> Turn:
+    """Take a turn, see `Embodied.turn`, without those neighbours whose messages spoil it."""
     whole = Turn(*core.turn(state, inbox, arrived, moment))
     if _sound(state, whole):
         return whole

@@ -26,10 +26,9 @@ import numpy as np
 from jax import Array
 
 from consat.network.alone import Alone, ends
-from consat.network.core import LARGEST, Core, Kept, Look, Moment, known_of
+from consat.network.core import LARGEST, Core, Kept, Moment
 from consat.network.part import Part
 from consat.numerics import quick_compilation
-from consat.protocols import agreement
 from consat.prox import Memory
 
 AGREE = 0.05
@@ -49,7 +48,6 @@ class LinkState(NamedTuple):
         valid: (E,) whether `theirs` says anything: a neighbour that has lost its memory knows no λ_ji yet.
         adopted: (E,) whether `force` does.
         memory: of the solver.
-        ages: see `consat.protocols.agreement`.
     """
 
     x: Array
@@ -59,12 +57,10 @@ class LinkState(NamedTuple):
     valid: Array
     adopted: Array
     memory: Memory
-    ages: agreement.Ages
 
 
 _PER: Mapping[str, Any] = {
     "x": "row", "force": "link", "there": "link", "theirs": "link", "valid": "link", "adopted": "link", "memory": "agent",
-    "ages": {"age": "agent", "heard": "link"},
 }  # fmt: skip
 
 
@@ -83,25 +79,24 @@ class LinkCore:
         self.part = whole.without(gone)
         self.ends = ends(self.part)
         self.solver = Alone.of(self.part)
-        self.width = 2 * self.part.team.dimension + 2
+        self.width = 2 * self.part.team.dimension + 1
         self.largest = np.full(self.width, LARGEST)
         self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray) -> LinkState:
         return self._begin(self.solver, first)
 
-    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, Look]:
+    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, np.ndarray]:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
-        state, outbox, margin, known = self._turn(self.solver, gains, state, inbox, arrived, moment)
-        return state, np.asarray(outbox), Look(np.asarray(state.x), float(np.asarray(margin)[0]), float(np.asarray(known)[0]))
+        state, outbox = self._turn(self.solver, gains, state, inbox, arrived, moment)
+        return state, np.asarray(outbox), np.asarray(state.x)
 
     def among(self, gone: Collection[str]) -> LinkCore:
         return LinkCore(self.whole, self.k1, self.k2, gone)
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray) -> LinkState:
-        """All that belongs to ends that live on does, but what is known of satisfaction is of a problem that is no more."""
-        fresh = self.begin(first)
-        return Kept.of(self, other).merge(_PER, state, fresh)._replace(ages=fresh.ages)
+        """All that belongs to ends that live on does."""
+        return Kept.of(self, other).merge(_PER, state, self.begin(first))
 
 
 def _begin(solver: Alone, first: Array) -> LinkState:
@@ -110,16 +105,16 @@ def _begin(solver: Alone, first: Array) -> LinkState:
     kappa = jnp.ones(len(first))
     return LinkState(
         first, jnp.zeros_like(there), there, jnp.zeros_like(there), nothing, nothing,
-        solver.recall(first, kappa), agreement.start(first, solver),
+        solver.recall(first, kappa),
     )  # fmt: skip
 
 
 def _turn(
     solver: Alone, gains: tuple[Array, Array], state: LinkState, inbox: Array, arrived: Array, moment: Moment
-) -> tuple[LinkState, Array, Array, Array]:
+) -> tuple[LinkState, Array]:
     state = _hear(solver, state, inbox, arrived)
     k1, k2 = gains
-    links, d = solver.links, state.x.shape[1]
+    links = solver.links
     h = jnp.maximum(moment.elapsed, SHORTEST)
     kappa = jnp.where(moment.fresh, jnp.minimum(k1 * k2, k2 / (2.0 * jnp.maximum(moment.delay, SHORTEST))), 0.0)
     theirs = jnp.where(state.valid[:, None] > 0, state.theirs, -state.force)
@@ -129,21 +124,18 @@ def _turn(
     pull = state.x / h + links.sum((k2 + spring)[:, None] * state.there) - z
     x, memory, _ = solver.prox(pull / stiff[:, None], stiff / k1, state.x, state.memory)
     force = state.force + (h * kappa)[:, None] * (links.at(x) - state.there)
-    ages, told = agreement.speak(known_of(state.ages, moment.fresh), x, solver)
-    state = state._replace(x=x, force=force, memory=memory, ages=ages)
-    outbox = jnp.concatenate([links.at(x), force, state.adopted[:, None], told[:, None]], axis=1)
-    assert outbox.shape[1] == 2 * d + 2
-    return state, outbox, solver.margin(x), agreement.known(ages, solver)
+    state = state._replace(x=x, force=force, memory=memory)
+    return state, jnp.concatenate([links.at(x), force, state.adopted[:, None]], axis=1)
 
 
 def _hear(solver: Alone, state: LinkState, inbox: Array, arrived: Array) -> LinkState:
     """Take in what came. Whoever has no λ yet takes over the neighbour's, and its estimates of the others; or 0 if both have none."""
     d = state.x.shape[1]
-    there, theirs, told, age = inbox[:, :d], inbox[:, d : 2 * d], inbox[:, 2 * d] > 0, inbox[:, 2 * d + 1]
+    there, theirs, told = inbox[:, :d], inbox[:, d : 2 * d], inbox[:, 2 * d] > 0
     sure, mine = (arrived & told)[:, None], state.adopted[:, None] > 0
     force = jnp.where(sure & mine, state.force - AGREE * (state.force + theirs), state.force)
     force = jnp.where(sure & ~mine, -theirs, force)
-    fresh = (arrived & told & (state.adopted <= 0)).astype(age.dtype)
+    fresh = (arrived & told & (state.adopted <= 0)).astype(inbox.dtype)
     count = solver.links.sum(fresh)
     taken = solver.links.sum(fresh[:, None] * there) / jnp.maximum(count, 1.0)[:, None]
     others = jnp.arange(len(state.x)) != solver.me
@@ -152,9 +144,8 @@ def _hear(solver: Alone, state: LinkState, inbox: Array, arrived: Array) -> Link
         force=force,
         there=jnp.where(arrived[:, None], there, state.there),
         theirs=jnp.where(sure, theirs, state.theirs),
-        valid=jnp.where(arrived, told.astype(age.dtype), state.valid),
+        valid=jnp.where(arrived, told.astype(inbox.dtype), state.valid),
         adopted=jnp.where(arrived, 1.0, state.adopted),
-        ages=agreement.hear(state.ages, age, arrived),
     )
 
 

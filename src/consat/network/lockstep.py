@@ -17,7 +17,7 @@ import numpy as np
 from consat.network.core import Moment
 from consat.network.paced import FAREWELLS
 from consat.network.persistence import Store
-from consat.network.station import Station
+from consat.network.station import SILENT, Station
 from consat.network.wire import SUPPORT, Kind
 
 RESEND: Final = 0.006
@@ -84,6 +84,8 @@ class Lockstep:
                 self._turn(now)
             elif now - self._spoke >= self._patience:
                 self._repeat(now)
+        if not self._over() and not station.fresh(SILENT).all():  # while the agent waits, what it knew grows old
+            station.conclude(False, float(self._round))
         due = station.watch()
         if self._ready() and self._state is not None:
             return min(due, self._began + self._period)
@@ -113,8 +115,11 @@ class Lockstep:
         self._rumours[neighbour] = reached, times
         return times >= SUPPORT
 
+    def _over(self) -> bool:
+        return self._turns is not None and self._round >= self._turns
+
     def _ready(self) -> bool:
-        if self._turns is not None and self._round >= self._turns:
+        if self._over():
             return False
         return self._round == 0 or all(map(self._heard, self.station.present))
 
@@ -137,7 +142,7 @@ class Lockstep:
         for neighbour in station.present if self._round else ():  # there is no round before the first
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.sort(neighbour, block, inbox, arrived)
-        moment = Moment(float(self._round - self._regrouped), 0.0, np.zeros(len(arrived)), np.ones(len(arrived), dtype=bool))
+        moment = self._moment(self._round - self._regrouped)
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
@@ -147,9 +152,14 @@ class Lockstep:
         self._save()
         self._speak(now)
         station.move(look, float(self._round))
-        if self._turns is not None and self._round >= self._turns:
+        if self._over():
             station.log("finished", round=self._round)
             station.report()
+
+    def _moment(self, number: int) -> Moment:
+        """Of a round, in which everybody was heard, however long it took."""
+        count = len(self.station.core.ends)
+        return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place())
 
     def _speak(self, now: float) -> None:
         station = self.station
@@ -164,8 +174,7 @@ class Lockstep:
     def _repeat(self, now: float) -> None:
         """Say again what was said last: to all while waiting, and after the last round to those who ask."""
         station = self.station
-        over = self._turns is not None and self._round >= self._turns
-        to = [neighbour for neighbour in station.present if not over or neighbour in self._lacking]
+        to = [neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking]
         self._spoke = now
         self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
@@ -187,8 +196,7 @@ class Lockstep:
             self._outbox = self._outbox[0][rows], self._outbox[1][rows]
         else:  # somebody joined, to whom nothing was said yet
             inbox, nothing = station.empty()
-            moment = Moment(0.0, 0.0, np.zeros(len(nothing)), np.ones(len(nothing), dtype=bool))
-            self._state, outbox, _ = station.turn(self._state, inbox, nothing, moment)
+            self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
             self._outbox = outbox, outbox
         self._save()
         self._speak(station.clock())

@@ -11,7 +11,7 @@ import numpy as np
 
 from consat.errors import InvalidSettings
 from consat.network.body import Body
-from consat.network.core import Core, RoundCore
+from consat.network.core import Embodied, RoundCore
 from consat.network.link_core import LinkCore
 from consat.network.lockstep import Lockstep
 from consat.network.paced import Paced
@@ -84,18 +84,18 @@ class Runner(Protocol):
         ...
 
 
-def core_of(part: Part, manner: Manner) -> Core:
+def core_of(part: Part, manner: Manner) -> Embodied:
     """What the agent computes."""
     asked = part.settings.protocol
     if manner.mode == "link":
         gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
-        return LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace)
+        return Embodied(LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace))
     kind = asked.kind or DEFAULT_MODE
     if manner.mode == "admm" and kind != "admm":
         raise InvalidSettings(f"mode admm runs the protocol admm, but the protocol is {kind}; mode lockstep runs every protocol in rounds")
     if kind not in ROUNDS:
         raise InvalidSettings(f"mode lockstep runs protocols in rounds, {', '.join(ROUNDS)}, but the protocol is {kind}")
-    return RoundCore(with_gains(ROUNDS[kind](), asked), part)
+    return Embodied(RoundCore(with_gains(ROUNDS[kind](), asked), part))
 
 
 def runner_of(
@@ -107,7 +107,7 @@ def runner_of(
     incarnation: int,
     body: Body,
     log: Log,
-    core: Core | None = None,
+    core: Embodied | None = None,
 ) -> Runner:
     """An agent ready to run; its first step will begin. `core` is what `core_of` gives, if that is at hand."""
     lockstep = manner.mode == "lockstep"

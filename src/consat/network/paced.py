@@ -98,7 +98,9 @@ class Paced:
         for neighbour, block in self._latest.items():
             station.sort(neighbour, block, inbox, arrived)
         self._latest.clear()
-        moment = Moment(float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale))
+        moment = Moment(
+            float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place()
+        )
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1

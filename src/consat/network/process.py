@@ -1,7 +1,10 @@
 """One agent as a process: its steps in real time over a real network, commands and measurements from stdin, JSON lines to stdout.
 
-A line on stdin is ``{"position": [x, y]}``, a measurement, or ``{"command": "stop"}`` or ``{"command": "leave"}``; what is anything else
-is reported and ignored. Each line on stdout is an event: ``start``, ``report``, ``command`` (a velocity), ``satisfied`` …
+A line on stdin is ``{"position": [x, y]}``, a measurement, which may have a ``"stamp"``, or ``{"command": "stop"}`` or
+``{"command": "leave"}``; what is anything else is reported and ignored. Each line on stdout is an event: ``start``, ``report``,
+``command`` (a velocity, and for how long it is valid), ``satisfied`` …
+
+Whatever ends the agent, or takes its sensor from it, its last command is to stand.
 """
 
 from __future__ import annotations
@@ -9,30 +12,26 @@ from __future__ import annotations
 import json
 import math
 import os
-import signal
 import sys
-import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final, Literal
 
 import jax
 import numpy as np
 
 from consat.network.body import MeasuredBody, SimulatedBody
-from consat.network.core import Core, Moment
+from consat.network.core import Embodied, Moment
+from consat.network.helm import Helm
 from consat.network.modes import Manner, Runner, core_of, runner_of
+from consat.network.orders import Orders, heeding_signals
 from consat.network.part import Part
 from consat.network.transports import Transport
 from consat.network.transports.weather import Weathered
 
-LONGEST_LINE: Final = 65536
-"""Characters read of a line on stdin."""
 NAP: Final = 0.05
 """No wait is longer, s, so that signals and commands are soon seen."""
 LINGER: Final = 2.0
@@ -49,6 +48,7 @@ class Circumstances:
         seed: of loss and delay.
         speed: the most that the body moves, length/s.
         sensor: ``simulated``, or ``stdin``: positions are measured by somebody else and read there.
+        sensor_timeout: after so long without a measurement, s, the body is commanded to stand.
         position: where a simulated body is; None for the start in the part.
         until: when to stop, s; None for never.
         stop: whether to stop once all are known to be satisfied.
@@ -61,6 +61,7 @@ class Circumstances:
     seed: int = 0
     speed: float = math.inf
     sensor: Literal["simulated", "stdin"] = "simulated"
+    sensor_timeout: float = 0.5
     position: tuple[float, ...] | None = None
     until: float | None = None
     stop: Literal["satisfied", "never"] = "never"
@@ -77,55 +78,60 @@ def run_agent(part: Part, manner: Manner, around: Circumstances) -> None:
     """
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    core = core_of(part, manner)
-    _warm(core)
-    orders = _Orders(part.team.dimension, reading=around.attached or around.sensor == "stdin")
-    body = MeasuredBody(around.speed) if around.sensor == "stdin" else SimulatedBody(_start(part, around), around.speed)
-    with _orders_by_signal(orders), _transport(part, manner, around) as transport:
-        runner = runner_of(
-            part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=body, log=_write, core=core
-        )
-        runner.station.log("start", mode=manner.mode, run=part.run, pid=os.getpid(), rounds=manner.mode == "lockstep")
-        why = _loop(runner, transport, orders, body, around)
-        runner.station.goodbye()
-        runner.station.report()
-        runner.station.log("end", why=why, cpu=round(time.process_time(), 3))
+    core, dimension = core_of(part, manner), part.team.dimension
+    measured = MeasuredBody(around.speed, around.sensor_timeout) if around.sensor == "stdin" else None
+    body = SimulatedBody(_start(part, around), around.speed) if measured is None else measured
+    orders = Orders(None if measured is None else dimension, reading=around.attached or measured is not None)
+    with heeding_signals(orders):
+        helm = Helm(part.me, dimension, measured, around.sensor_timeout, _write)
+        _warm(core)
+        with _transport(part, manner, around) as transport:
+            runner = runner_of(
+                part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=body, log=_write, core=core
+            )
+            runner.station.log("start", mode=manner.mode, run=part.run, pid=os.getpid(), rounds=manner.mode == "lockstep")
+            try:
+                why = _loop(runner, transport, orders, helm, around)
+            finally:
+                helm.stand()
+            runner.station.goodbye()
+            runner.station.report()
+            runner.station.log("end", why=why, cpu=round(time.process_time(), 3))
 
 
-def _loop(runner: Runner, transport: Transport, orders: _Orders, body: SimulatedBody | MeasuredBody, around: Circumstances) -> str:
-    began, known_since = time.monotonic(), math.inf
-    told: np.ndarray | None = None
+def _loop(runner: Runner, transport: Transport, orders: Orders, helm: Helm, around: Circumstances) -> str:
+    station, end = runner.station, math.inf if around.until is None else time.monotonic() + around.until
+    known_since = math.inf
     while True:
+        helm.sense(orders)
         due = runner.step()
         now = time.monotonic()
-        station = runner.station
-        if isinstance(body, MeasuredBody):
-            orders.measure(body)
-            if station.velocity is not None and station.velocity is not told:
-                told = station.velocity
-                station.log("command", velocity=told.tolist())
-        for line in orders.rejected():
-            station.log("rejected", line=line)
+        helm.sense(orders)  # what came during the step
+        helm.steer(station.target)
+        for line, why in orders.rejected():
+            station.log("rejected", line=line, why=why)
         if orders.leaving:
             orders.leaving = False
+            helm.stand()
             runner.leave()
         known_since = min(known_since, now) if station.satisfied else math.inf
         if runner.done:
             return "done"
         if orders.stopped:
             return orders.stopped
-        if around.until is not None and now - began >= around.until:
+        if now >= end:
             return "out of time"
         if around.stop == "satisfied" and now - known_since >= LINGER:
             return "satisfied"
         transport.wait(min(max(due - now, 0.0), NAP))
 
 
-def _warm(core: Core) -> None:
+def _warm(core: Embodied) -> None:
     """Compile before the first neighbour can wait for it."""
     count = len(core.ends)
-    moment = Moment(0.0, 1.0, np.zeros(count), np.ones(count, dtype=bool))
-    core.turn(core.begin(core.part.first), np.zeros((count, core.width)), np.zeros(count, dtype=bool), moment)
+    moment = Moment(0.0, 1.0, np.zeros(count), np.ones(count, dtype=bool), np.zeros(core.part.team.dimension))
+    _, _, look = core.turn(core.begin(core.part.first), np.zeros((count, core.width)), np.zeros(count, dtype=bool), moment)
+    core.margin(look.bodies)
 
 
 def _start(part: Part, around: Circumstances) -> np.ndarray:
@@ -159,69 +165,3 @@ def _protected(address: str) -> str:
 def _write(event: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(event) + "\n")
     sys.stdout.flush()
-
-
-class _Orders:
-    """What stdin and signals say."""
-
-    def __init__(self, dimension: int, *, reading: bool) -> None:
-        self.stopped = ""
-        self.leaving = False
-        self._dimension = dimension
-        self._positions: deque[np.ndarray] = deque(maxlen=1)
-        self._rejected: deque[str] = deque(maxlen=16)
-        if reading:
-            threading.Thread(target=self._read, name="stdin", daemon=True).start()
-
-    def measure(self, body: MeasuredBody) -> None:
-        """Hand on the newest measurement."""
-        if self._positions:
-            body.measure(self._positions.pop())
-
-    def rejected(self) -> Iterator[str]:
-        """The lines that mean nothing, each once."""
-        while self._rejected:
-            yield self._rejected.popleft()
-
-    def _read(self) -> None:
-        while line := sys.stdin.readline(LONGEST_LINE):
-            if not self._take(line):
-                self._rejected.append(line.strip()[:80])
-        self.stopped = self.stopped or "stdin ended"
-
-    def _take(self, line: str) -> bool:
-        try:
-            order = json.loads(line)
-        except (ValueError, RecursionError):
-            return False
-        if not isinstance(order, dict):
-            return False
-        position, command = order.get("position"), order.get("command")
-        if command == "stop":
-            self.stopped = "told to stop"
-        elif command == "leave":
-            self.leaving = True
-        elif isinstance(position, list) and len(position) == self._dimension and all(map(_is_coordinate, position)):
-            self._positions.append(np.array(position, dtype=float))
-        else:
-            return False
-        return True
-
-
-def _is_coordinate(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 1e100
-
-
-@contextmanager
-def _orders_by_signal(orders: _Orders) -> Iterator[None]:
-    """SIGTERM and Ctrl-C stop the agent after its step, so that it can say goodbye."""
-
-    def stop(number: int, _: FrameType | None) -> None:
-        orders.stopped = signal.Signals(number).name
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -9,7 +9,7 @@ import numpy as np
 
 from consat.network import guard
 from consat.network.body import Body
-from consat.network.core import LARGEST, Core, Look, Moment
+from consat.network.core import LARGEST, Embodied, Look, Moment
 from consat.network.membership import Membership
 from consat.network.part import Part
 from consat.network.peers import Peers
@@ -45,7 +45,7 @@ class Station:
     def __init__(
         self,
         part: Part,
-        core: Core,
+        core: Embodied,
         mode: str,
         transport: Transport,
         *,
@@ -75,6 +75,9 @@ class Station:
         self._down = frozenset(self.peers.all)
         self._next_report = clock()
         self._gone: frozenset[str] = frozenset()
+        self._look: Look | None = None
+        self.target: np.ndarray | None = None
+        """(d,) where the body should be, once that is known."""
         self.regroup(None, part.first)
 
     # -- who is there ------------------------------------------------------------------------------------------------------------------
@@ -92,7 +95,7 @@ class Station:
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
             before, self.core = self.core, self.core.among(gone)
-            self._gone = gone
+            self._gone, self._look = gone, None
             if state is not None:
                 state = self.core.carry(before, state, self.among(first))
         place = {end: k for k, end in enumerate(self.core.ends)}
@@ -164,7 +167,7 @@ class Station:
         arrived[place[agrees]] = True
 
     def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
-        """See `Core.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
+        """See `Embodied.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
             self.log("refused", peer=neighbour)
@@ -192,7 +195,7 @@ class Station:
         now = self.clock()
         return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
 
-    # -- time --------------------------------------------------------------------------------------------------------------------------
+    # -- time and place --------------------------------------------------------------------------------------------------------------------
 
     def delays(self) -> np.ndarray:
         """(E,) half the round trip to the neighbour of each end, s; 0 before it is known."""
@@ -204,7 +207,14 @@ class Station:
         now = self.clock()
         return np.array([now - self.peers.all[neighbour].heard <= within for neighbour, _ in self.core.ends], dtype=bool)
 
-    # -- the log -----------------------------------------------------------------------------------------------------------------------
+    def place(self) -> np.ndarray:
+        """(d,) where the body is, NaN where that is not known."""
+        position = self.body.position()
+        if position is None or not self.body.sensed(self.clock()):
+            return np.full(self.part.team.dimension, np.nan)
+        return position
+
+    # -- the log ---------------------------------------------------------------------------------------------------------------------------
 
     def log(self, event: str, **details: Any) -> None:
         """One event."""
@@ -217,20 +227,25 @@ class Station:
             look: of the last turn.
             stamp: round or time, of the track.
         """
-        target = look.x[self.core.part.team.ids.index(self.part.me)]
-        self.velocity = self.body.follow(target, self.clock())
+        self.target = look.x[self._me()]
+        self.body.follow(self.target, self.clock())
         position = self.body.position()
         if position is not None:
             self._track.append([stamp, *position.tolist()])
         self._look = look
-        if (look.known > 0) != self._satisfied:
-            self._satisfied = look.known > 0
-            self.log("satisfied" if self._satisfied else "unsatisfied", stamp=stamp)
+        self.conclude(look.known > 0, stamp)
         if self._period <= 0:
             self.report()
 
-    _look: Look | None = None
-    velocity: np.ndarray | None = None
+    def conclude(self, satisfied: bool, stamp: float) -> None:
+        """Whether the agent knows that all are satisfied; told if it is news."""
+        if satisfied != self._satisfied:
+            self._satisfied = satisfied
+            self.log("satisfied" if satisfied else "unsatisfied", stamp=stamp)
+
+    def _me(self) -> int:
+        """The agent's row among those who are there."""
+        return self.core.part.team.ids.index(self.part.me)
 
     def watch(self) -> float:
         """Log who went down or came up, and a report when one is due; when the next is."""
@@ -253,8 +268,19 @@ class Station:
         return self._next_report
 
     def report(self) -> None:
-        """How things stand, and where the body was since the last report."""
+        """How things stand, and where the body was since the last report.
+
+        `margin` is that of the agent at its `position`, and where it last heard that the others' bodies are; `estimate_margin` at its
+        estimates.
+        """
         look, position = self._look, self.body.position()
+        margin = estimate_margin = None
+        if look is not None:
+            estimate_margin = _number(self.core.margin(look.x))
+            if look.heard and position is not None:
+                bodies = look.bodies.copy()
+                bodies[self._me()] = position
+                margin = _number(self.core.margin(bodies))
         peers = {}
         for neighbour, peer in self.peers.all.items():
             if neighbour not in self._gone:
@@ -266,7 +292,8 @@ class Station:
         self.log(
             "report",
             position=None if position is None else position.tolist(),
-            margin=None if look is None else _number(look.margin),
+            margin=margin,
+            estimate_margin=estimate_margin,
             known=None if look is None else look.known,
             track=self._track,
             peers=peers,

@@ -1,4 +1,4 @@
-"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 1.
+"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 2.
 
     offset  bytes  what
     0       4      b"csat"
@@ -37,7 +37,8 @@ import numpy as np
 from consat.errors import NetworkError, shown
 
 MAGIC: Final = b"csat"
-VERSION: Final = 1
+VERSION: Final = 2
+"""Since messages tell of bodies. Others are refused."""
 LONGEST: Final = 2**22
 """No message has more bytes."""
 MOST_ARRAYS: Final = 32

@@ -91,6 +91,10 @@ class Links(Protocol):
         """(links, …) → (rows, …): the sum over the links of each copy."""
         ...
 
+    def least(self, links: Array) -> Array:
+        """(links, …) → (rows, …): the smallest over the links of each copy, +∞ without links."""
+        ...
+
 
 class Solver(Protocol):
     """What an agent can ask of itself in rounds."""

@@ -117,7 +117,7 @@ class ManyProcesses:
         now = run.begin(self._protocol, world, jnp.asarray(self._first), jax.random.key(self._seed))
         book, zero = run.empty(now, rows), jnp.asarray(0)
         spoken, out = run.speak(self._protocol, world, now, jnp.asarray(0.0), self._messages.out)
-        now, book = run.hear(self._protocol, world, now, spoken, (out, self._messages.into), (book, rows, zero))
+        now, book = run.hear(self._protocol, world, spoken, (out, self._messages.into), (book, rows, zero))
         across = run.pack_positions(book.body, self._positions.out)
         jax.block_until_ready(run.look(world, run.note(book, now, rows, zero), now.body, across, self._positions.into))
 
@@ -136,7 +136,7 @@ class ManyProcesses:
             spoken, out = run.speak(self._protocol, self.world, now, at, self._messages.out)
             into = self._exchanged(out)
             noted = (book, jnp.asarray(self._rows.mine), jnp.asarray(k))
-            now, book = run.hear(self._protocol, self.world, now, spoken, (into, self._messages.into), noted)
+            now, book = run.hear(self._protocol, self.world, spoken, (into, self._messages.into), noted)
         numbers = np.arange(number + 1, number + 1 + count)
         chunk = self._seen(book, state.now.body, np.flatnonzero(numbers % every == 0), count)
         if self._hold is not None:
@@ -261,16 +261,14 @@ class _Programs(NamedTuple):
 
 def _packed(spoken: Spoken) -> Array:
     """(E, W) everything that crosses with a message."""
-    leaves = [*jax.tree.leaves(spoken.message), spoken.told]
-    return jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+    return jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(spoken.crossing)], axis=1)
 
 
 def _with(spoken: Spoken, packed: Array) -> Spoken:
-    leaves, structure = jax.tree.flatten(spoken.message)
-    sizes = np.cumsum([leaf[0].size for leaf in leaves])
-    *found, told = jnp.split(packed, sizes, axis=1)
-    message = [new.reshape(old.shape) for new, old in zip(found, leaves, strict=True)]
-    return spoken._replace(message=jax.tree.unflatten(structure, message), told=told[:, 0])
+    leaves, structure = jax.tree.flatten(spoken.crossing)
+    found = jnp.split(packed, np.cumsum([leaf[0].size for leaf in leaves])[:-1], axis=1)
+    crossing = [new.reshape(old.shape) for new, old in zip(found, leaves, strict=True)]
+    return spoken._replace(crossing=jax.tree.unflatten(structure, crossing))
 
 
 @functools.cache
@@ -290,12 +288,10 @@ def _compiled() -> _Programs:
         spoken = speak(protocol, world, now, number)
         return spoken, _packed(spoken)[out]
 
-    def hear_(
-        protocol: Rounds, world: World, now: Now, spoken: Spoken, heard: tuple[Array, Array], noted: tuple[_Book, Array, Array]
-    ) -> Any:
+    def hear_(protocol: Rounds, world: World, spoken: Spoken, heard: tuple[Array, Array], noted: tuple[_Book, Array, Array]) -> Any:
         came, into = heard
         packed = _packed(spoken).at[into.reshape(-1)].set(came.reshape(-1, came.shape[-1]), mode="drop")
-        now, known = hear(protocol, world, now, _with(spoken, packed))
+        now, known = hear(protocol, world, _with(spoken, packed))
         book, rows, place = noted
         counts = {"known": known, "messages": spoken.messages, "floats": spoken.floats}
         book = book._replace(**{name: getattr(book, name).at[place].set(value.astype(float)) for name, value in counts.items()})

@@ -70,6 +70,9 @@ class Ends:
     def sum(self, links: Array) -> Array:
         return self._in_blocks(self.groups.sum, links)
 
+    def least(self, links: Array) -> Array:
+        return -self._in_blocks(self.groups.max, -links)
+
     def across(self, links: Array) -> Array:
         """(E, …) → (E, …): what stands at the other ends."""
         return self._in_blocks(lambda blocks: pick(blocks, self.other), links)
@@ -116,11 +119,16 @@ class Body:
 
     Attributes:
         rate: rounds a second, Hz.
-        speed: the most that a body moves, length/s.
+        speed: the most that a body moves, length/s; if infinite it is where its agent wants to be.
     """
 
     rate: float
     speed: float = np.inf
+
+    @property
+    def reach(self) -> float | None:
+        """The most that it moves in a round; None without limit."""
+        return self.speed / self.rate if np.isfinite(self.speed) else None
 
 
 class Seen(NamedTuple):
@@ -168,6 +176,7 @@ class World:
         talker: (E,) who speaks at each end.
         pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
         reach: most that a body moves in a round; None if it can jump.
+        owners: see `consat.protocols.agreement`; None where bodies can jump, and are where the estimates are.
         loss: see `Weather`.
         sleep: see `Weather`.
         pairs: how many directed pairs.
@@ -181,6 +190,7 @@ class World:
     talker: Array
     pair: Array
     reach: Array | None
+    owners: agreement.Owners | None
     loss: Array
     sleep: Array
     pairs: int = field(metadata={"static": True})
@@ -196,12 +206,14 @@ class Now(NamedTuple):
         ages: of `consat.protocols.agreement`.
         body: (N, d).
         key: of the random draws.
+        heard: what they know of each other's bodies; None where bodies can jump.
     """
 
     state: Any
     ages: agreement.Ages
     body: Array
     key: Array
+    heard: agreement.Bodies | None = None
 
 
 class Spoken(NamedTuple):
@@ -210,8 +222,9 @@ class Spoken(NamedTuple):
     Attributes:
         state: of the protocol, after its step.
         ages: likewise.
-        message: what stands at each end, on its way to the other.
-        told: (E,) the ages among it.
+        body: (N, d) likewise.
+        heard: likewise.
+        crossing: what stands at each end, on its way to the other: the protocol's message, the ages, (E,), and word of bodies, if any.
         went: (E,) whether it was sent and not lost; None where nothing is.
         key: of the random draws that follow.
         messages: sent.
@@ -220,8 +233,9 @@ class Spoken(NamedTuple):
 
     state: Any
     ages: agreement.Ages
-    message: Any
-    told: Array
+    body: Array
+    heard: agreement.Bodies | None
+    crossing: tuple[Any, Array, agreement.Word | None]
     went: Array | None
     key: Array
     messages: Array
@@ -231,7 +245,7 @@ class Spoken(NamedTuple):
 def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
     """What all agents do in one round."""
     spoken = speak(protocol, world, now, round_)
-    now, known = hear(protocol, world, now, spoken)
+    now, known = hear(protocol, world, spoken)
     return now, see(world, now.state.x, now.body, known, spoken.messages, spoken.floats)
 
 
@@ -240,21 +254,32 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     everyone, ends = world.everyone, world.everyone.links
     state, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
     ages, told = agreement.speak(now.ages, state.x, everyone)
-    key, went = now.key, None
+    key, went, awake = now.key, None, None
     sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
     counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
     if world.rough:
         key, awake, through = _luck(world, now.key)
         state = _where_awake(protocol.per, world, awake, state, now.state)
-        ages = _where_awake({"age": "agent", "heard": "link"}, world, awake, ages, now.ages)
+        ages = _where_awake(_AGES, world, awake, ages, now.ages)
         goes = awake[world.talker]
         went = goes & through[world.pair]
         counted = goes if counted is None else goes & counted
     if counted is not None:
         sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
         copies_sent = jnp.sum(counted)
-    floats = sent + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in jax.tree.leaves(message))
-    return Spoken(state, ages, message, told, went, key, sent, floats)
+    body = _moved(now.body, pick(state.x, world.own), world.reach)
+    heard, word = now.heard, None
+    if now.heard is not None and world.owners is not None:
+        heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
+        if awake is not None:
+            heard = _where_awake(_BODIES, world, awake, heard, now.heard)
+    per_copy = jax.tree.leaves((message, () if word is None else (word.position, word.stale)))
+    floats = sent * (1 if word is None else 2) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
+    return Spoken(state, ages, body, heard, (message, told, word), went, key, sent, floats)
+
+
+_AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
+_BODIES: Mapping[str, Any] = {"position": "row", "stale": "row", "ages": _AGES}
 
 
 def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
@@ -269,14 +294,17 @@ def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
     return key, awake >= world.sleep, through >= world.loss
 
 
-def hear(protocol: Rounds, world: World, now: Now, spoken: Spoken) -> tuple[Now, Array]:
+def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, Array]:
     """The second half of a round; tells also whether everybody knows that all are satisfied."""
     everyone, ends = world.everyone, world.everyone.links
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
-    state = protocol.hear(spoken.state, jax.tree.map(ends.across, spoken.message), arrived, everyone)
-    ages = agreement.hear(spoken.ages, ends.across(spoken.told), arrived)
-    body = _moved(now.body, pick(state.x, world.own), world.reach)
-    return Now(state, ages, body, spoken.key), jnp.all(agreement.known(ages, everyone) > 0)
+    message, told, word = jax.tree.map(ends.across, spoken.crossing)
+    state = protocol.hear(spoken.state, message, arrived, everyone)
+    ages, heard = agreement.hear(spoken.ages, told, arrived), spoken.heard
+    if heard is not None and word is not None and world.owners is not None:
+        heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
+    known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
+    return Now(state, ages, spoken.body, spoken.key, heard), jnp.all(known if world.part is None else known | ~world.part.ours)
 
 
 def _moved(body: Array, target: Array, reach: Array | None) -> Array:
@@ -321,7 +349,8 @@ def many_rounds(
 def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now, Seen]:
     """The start from first estimates, (C, d), and what is seen of it."""
     start = first[world.own]
-    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key)
+    heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
+    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
     return now, see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0))
 
 
@@ -356,15 +385,22 @@ def world_of(
     pairs = distinct(keys)
     if not (rough or partial):  # then nobody asks who is at the ends
         talker, keys = talker[:0], keys[:0]
+    reach = None if body is None else body.reach
     return World(
         everyone=everyone,
         observer=Objective.at_positions(team),
         own=jnp.asarray(copies.own),
         talker=jnp.asarray(talker),
         pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
-        reach=None if body is None else jnp.asarray(body.speed / body.rate),
+        reach=None if reach is None else jnp.asarray(reach),
+        owners=None if reach is None else _owners(copies, receiver, sender, block),
         loss=jnp.asarray(weather.loss),
         sleep=jnp.asarray(weather.sleep),
         pairs=len(pairs),
         rough=rough,
     )
+
+
+def _owners(copies: Estimates, receiver: np.ndarray, sender: np.ndarray, block: int) -> agreement.Owners:
+    row, other = ((ends.astype(np.int64)[:, None] * block + np.arange(block)).ravel() for ends in (receiver, sender))
+    return agreement.Owners.of(copies.own, row, copies.holder[other] == copies.position[other], copies.count)
