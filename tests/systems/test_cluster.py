@@ -52,10 +52,14 @@ def check_same(several: dict[str, Any], one: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("count", "options", "how"),
     [
-        (2, ["--loss", "0.2", "--sleep", "0.1"], {"loss": 0.2, "sleep": 0.1}),
+        (
+            2,
+            ["--loss", "0.2", "--sleep", "0.1", "--rate", "10", "--speed", "2", "--rounds", "70"],
+            {"loss": 0.2, "sleep": 0.1, "rate": 10, "speed": 2, "rounds": 70},
+        ),
         (4, ["--rounds", "33", "--protocol", "proximal"], {"rounds": 33, "protocol": "proximal"}),
     ],
-    ids=["two, with losses", "four, proximal"],
+    ids=["two, with losses and bodies", "four, proximal"],
 )
 def test_processes_agree_with_one(count: int, options: list[str], how: dict[str, Any], tmp_path: Path) -> None:
     file, team = tmp_path / "lattice.yaml", lattice(6)

@@ -84,7 +84,7 @@ class Lockstep:
                 self._turn(now)
             elif now - self._spoke >= self._patience:
                 self._repeat(now)
-        if not self._over() and not station.fresh(SILENT).all():  # while the agent waits, what it knew grows old
+        if not self._over() and now - self._began > max(SILENT, 3.0 * self._period):  # while the agent waits, what it knew grows old
             station.conclude(False, float(self._round))
         due = station.watch()
         if self._ready() and self._state is not None:
