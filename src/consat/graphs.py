@@ -119,6 +119,25 @@ def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarr
     return depth[1:] - 1, order[1:]
 
 
+def middles(count: int, links: np.ndarray) -> np.ndarray:
+    """(K,) for each component an agent from which no other is far: the middle of a longest path, which is exact on trees and close elsewhere.
+
+    Args:
+        count: N.
+        links: (L, 2).
+    """
+    labels = _components(links, count)
+    starts, far = np.unique(labels, return_index=True)[1], np.zeros(count, dtype=np.int64)
+    for turn in range(3):
+        depth, order = _depths(links, count, starts)
+        if turn:
+            far[order] = np.maximum(far[order], depth)
+        starts = np.zeros(len(starts), dtype=np.intp)
+        starts[labels[order]] = order  # the last one stays: the deepest of its component
+    order = np.lexsort((np.arange(count), far, labels))
+    return order[np.unique(labels[order], return_index=True)[1]]
+
+
 def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
     """Who holds a copy of whose position under local estimates: i holds x_j if some ψ of i reads x_j, j holds its own, and relays
     hold it where the links among these alone would leave them in pieces.

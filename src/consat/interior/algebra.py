@@ -1,0 +1,114 @@
+"""Linear algebra of many small symmetric systems at once; the systems are the last axis of every array, the lanes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+LOOPED = 16
+"""Systems of up to so many unknowns are eliminated by a loop over the pivots, larger ones by halves."""
+
+
+def product(left: Array, right: Array) -> Array:
+    """(i, k, A), (k, j, A) → (i, j, A)."""
+    found = jnp.matmul(jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0))
+    return jnp.moveaxis(found, 0, -1)
+
+
+def times(matrix: Array, vector: Array) -> Array:
+    """(N, N, A), (N, A) → (N, A)."""
+    return jnp.sum(matrix * vector[None], axis=1)
+
+
+def gram(weight: Array, vectors: Array) -> Array:
+    """(N, N, A) Σ_k w_k v_k v_kᵀ from (m, A) and (m, N, A)."""
+    weighted = weight[:, None] * vectors
+    if vectors.size * vectors.shape[1] <= 2**22:
+        return jnp.sum(weighted[:, :, None] * vectors[:, None], axis=0)
+    first = jnp.moveaxis(vectors, -1, 0)
+    return jnp.moveaxis(jnp.einsum("aki,akj->aij", jnp.moveaxis(weighted, -1, 0), first), 0, -1)
+
+
+def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
+    """Solve a symmetric positive definite system in every lane.
+
+    Args:
+        matrix: (N, N, A).
+        right: (N, r, A).
+
+    Returns:
+        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
+    """
+    size = len(matrix)
+    if size > LOOPED:  # by halves
+        half = size // 2
+        corner = jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
+        found, first = solve(matrix[:half, :half], corner)
+        filled = product(matrix[half:, :half], found)
+        rest = size - half
+        below, second = solve(matrix[half:, half:] - filled[:, :rest], right[half:] - filled[:, rest:])
+        above = found[:, rest:] - product(found[:, :rest], below)
+        return jnp.concatenate([above, below]), first & second
+
+    def eliminate(j: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+        whole, positive = at
+        pivot = whole[j, j]
+        row = whole[j] / pivot[None]
+        factor = jnp.where(jnp.arange(size)[:, None] == j, 0.0, whole[:, j])
+        return (whole - factor[:, None] * row[None]).at[j].set(row), positive & (pivot > 0)
+
+    start = jnp.concatenate([matrix, right], axis=1), jnp.ones(matrix.shape[-1], bool)
+    whole, positive = jax.lax.fori_loop(0, size, eliminate, start)
+    return whole[:, size:], positive
+
+
+def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Array, Array]:
+    """Add up the neighbours' quadratics over an agent's own variables.
+
+    Args:
+        matrix: (g, p, p, A) of the neighbours.
+        vector: (g, p, A) of the neighbours.
+        shared: (g, p, A) which of the own variables these are; N and more: none.
+        size: N.
+
+    Returns:
+        (N, N, A) and (N, A).
+    """
+    lane = jnp.arange(shared.shape[-1])
+    whole = jnp.zeros((size, size, len(lane))).at[shared[:, :, None], shared[:, None], lane].add(matrix, mode="drop")
+    return whole, jnp.zeros((size, len(lane))).at[shared, lane].add(vector, mode="drop")
+
+
+def reduced(matrix: Array, vector: Array, shared: Array) -> tuple[Array, Array, Array, Array]:
+    """Minimise ½ yᵀMy − hᵀy over all variables but those shared with a neighbour, for each neighbour (a Schur complement).
+
+    Args:
+        matrix: (N, N, A) M.
+        vector: (N, A) h.
+        shared: (g, p, A) the variables that stay; N and more: none.
+
+    Returns:
+        (g, p, p, A) and (g, p, A) the quadratic that is left, (g, A) how much the minimum is below zero, and (g, A) whether M is positive
+        definite on what is eliminated.
+    """
+    size, count = vector.shape
+    g, p, _ = shared.shape
+    shared = jnp.moveaxis(shared, 1, 0)  # (p, g, A)
+    stays = (jnp.arange(size)[:, None, None, None] == shared[None]).any(axis=1)  # (N, g, A)
+    inner = jnp.where(stays[:, None] | stays[None], jnp.eye(size)[:, :, None, None], matrix[:, :, None])
+    there, inside = shared < size, jnp.minimum(shared, size - 1)
+    whole = jnp.broadcast_to(matrix[:, :, None], (size, size, g, count))
+    columns = jnp.where(there[None], jnp.take_along_axis(whole, inside[None], axis=1), 0.0)  # (N, p, g, A)
+    sides = jnp.concatenate([columns, jnp.broadcast_to(vector[:, None, None], (size, 1, g, count))], axis=1)
+    out = jnp.where(stays[:, None], 0.0, sides)
+    found, positive = solve(inner.reshape(size, size, g * count), out.reshape(size, p + 1, g * count))
+    found = found.reshape(size, p + 1, g, count)
+    if size > LOOPED:
+        filled = product(jnp.swapaxes(out, 0, 1).reshape(p + 1, size, -1), found.reshape(size, p + 1, -1)).reshape(p + 1, p + 1, g, count)
+    else:
+        filled = jnp.sum(out[:, :, None] * found[:, None], axis=0)
+    kept = jnp.where(there[:, None], jnp.take_along_axis(sides, inside[:, None], axis=0), 0.0)  # (p, p + 1, g, A)
+    left = kept - filled[:p]
+    square = 0.5 * (left[:, :p] + jnp.swapaxes(left[:, :p], 0, 1))
+    return jnp.moveaxis(square, 2, 0), jnp.moveaxis(left[:, p], 1, 0), 0.5 * filled[p, p], positive.reshape(g, count)
