@@ -107,6 +107,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "…"
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """``1 cluster``, ``2,000 clusters``; `many` is given where it is not `one` with an s."""
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
 def dotted(path: Iterable[str | int]) -> str:
     """``("agents", 1, "radius")`` as ``agents[1].radius``."""
     text = ""

@@ -39,7 +39,6 @@ class Trace:
         period: of a round, s; None in continuous time, and where rounds take no time.
         recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
         final: (N, d) everyone's last positions, where not all were recorded.
-        drift: how far any agent moved, on any axis, over the last ten steps of the run; None to read it off `position`.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -64,21 +63,12 @@ class Trace:
     period: float | None = None
     recorded: np.ndarray | None = None
     final: np.ndarray | None = None
-    drift: float | None = None
     file: Path | None = None
 
     @property
     def end(self) -> np.ndarray:
         """(N, d) everyone's last positions."""
         return self.position[-1] if self.final is None else self.final
-
-    @property
-    def moved_lately(self) -> float:
-        """How far any agent moved, on any axis, over the last ten steps; ∞ for a run that has not been so long."""
-        if self.drift is not None:
-            return self.drift
-        lately = self.position[-10:]
-        return float(np.abs(lately - lately[-1]).max(initial=0.0)) if len(self.position) > 10 else np.inf
 
 
 def satisfied_from(steps: np.ndarray, margin: np.ndarray, *, interpolate: bool) -> float | None:

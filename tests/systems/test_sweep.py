@@ -36,8 +36,8 @@ def test_runs_of_a_batch_are_those_that_they_are_by_themselves() -> None:
     for row in found.runs:
         scenario = cs.load("case-c", [f"agents.a2.constraints.0.radius={row['agents.a2.constraints.0.radius']}"])
         check_against_single(row, cs.run(scenario, seed=row["seed"], loss=row["loss"], sleep=0.1).summary)
-    # some of each kind: a reach of 1.2 is infeasible
-    assert {row["status"] for row in found.runs} == {"satisfied", "least-violating"}
+    # some of each kind: a reach of 1.2 is infeasible, and admm ends at the best smooth margin, which is not the best margin
+    assert {row["status"] for row in found.runs} == {"satisfied", "not-converged"}
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ AGENT = [
         "14:25: .*no agent 'a2'"),
     bad("    start: [3, 1]", "    colour: red", r"6:5: agents\[0\]: there is no key 'colour'; the keys are id, start, constraints$"),
     bad("start: [3, 1]", "start: 3", "6:12: agent 'a1': start is 3, but must be a list of 2 numbers"),
-    bad("start: [3, 1]", "start: [3]", "6:12: agent 'a1': start has 1 entries, but must have 2"),
+    bad("start: [3, 1]", "start: [3]", "6:12: agent 'a1': start has 1 entry, but must have 2"),
     bad("start: [3, 1]", "start: [3, x]", "6:12: agent 'a1': start holds 'x'"),
     bad("start: [3, 1]", "start: [3, .nan]", "6:12: agent 'a1': start holds nan"),
     bad("start: [3, 1]", "start: {x: 3, y: 1}", "6:12: agent 'a1': start is {'x': 3, 'y': 1}, but must be a list of 2 numbers"),
@@ -134,7 +134,7 @@ CONSTRAINT = [
     bad("low: [-4, -4]", "low: [5, -4]", r"13:41: agent 'a2', .*high is \[4.0, 4.0\], but must be above low \[5.0, -4.0\]"),
     bad("low: [-4, -4]", "low: []", "13:26: agent 'a2', .*low has 0 entries"),
     bad("low: [-4, -4]", "low: [1, [2]]", r"13:26: agent 'a2', .*low holds \[2\]"),
-    bad("low: [-4, -4]", f"low: {[0] * 5000}", "13:26: agent 'a2', .*low has 5000 entries"),
+    bad("low: [-4, -4]", f"low: {[0] * 5000}", "13:26: agent 'a2', .*low has 5,000 entries"),
     bad("low: [-4, -4], ", "", "13:9: agent 'a2', constraint 'box': low is missing; box needs low, high"),
 ]
 EXPRESSION = [

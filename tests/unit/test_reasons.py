@@ -96,7 +96,7 @@ def test_what_is_not_proven_is_not_said() -> None:
 
 def test_a_feasible_team_is_told_what_limits_it() -> None:
     (said,) = sentences(case("c"))
-    assert said.startswith("Every constraint can hold. The best margin that can be is 0.1861, limited by a2's near(a3)")
+    assert said.startswith("Every constraint can hold. The best margin is 0.1861, limited by a2's near(a3)")
 
 
 def test_of_many_that_bind_a_little_each_some_are_named() -> None:

@@ -83,10 +83,8 @@ def explain(team: Team, optimum: Optimum) -> list[str]:
     if not sentences:
         worst = int(np.argmin(margins))
         binding = _binding(optimum.multipliers, cluster[team.owner] == worst)
-        best = "can be" if optimum.exact else "found"
-        sentences.append(
-            f"Every constraint can hold. The best margin that {best} is {_number(optimum.margin)}, limited by {_listed(team, binding)}."
-        )
+        best = "best margin" if optimum.exact else "best margin found"
+        sentences.append(f"Every constraint can hold. The {best} is {_number(optimum.margin)}, limited by {_listed(team, binding)}.")
     return sentences
 
 

@@ -190,9 +190,9 @@ def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: 
     assert best is not None
     found = f"best of {count} starts, ν-continuation and sequential cone programs (Clarabel)"
     if not concave:
-        return Optimum(best[0], float(best[2].min()), best[1], f"{found}: the margin is the best found, not the best possible", exact=False)
+        return Optimum(best[0], float(best[2].min()), best[1], found, exact=False)
     exact = bool(best[3].all())
-    note = "concave constraints: exact" if exact else "concave constraints, not converged: the margin is the best found"
+    note = "concave constraints: exact" if exact else "concave constraints, not converged"
     return Optimum(best[0], float(best[2].min()), best[1], f"{note}, {found}", exact=exact)
 
 

@@ -40,7 +40,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from consat.constraints.functions import safe_norm
-from consat.errors import InvalidExpression
+from consat.errors import InvalidExpression, counted
 
 MAX_LENGTH: Final = 2000
 MAX_DEPTH: Final = 50
@@ -388,7 +388,9 @@ def _evaluate(node: _Node, positions: Sequence[Array], numbers: Array) -> Array:
         odd = next(operand for operand, kind in zip(node.operands, kinds, strict=True) if kind != wanted)
         raise InvalidExpression(operation.wrong or f"{_usage(node.operation)} takes {_KINDS[wanted]}", odd.column)
     if node.operation == "vector" and len(values) != positions[0].size:
-        raise InvalidExpression(f"a vector has {positions[0].size} entries here, one a dimension, but this has {len(values)}", node.column)
+        raise InvalidExpression(
+            f"a vector has {counted(positions[0].size, 'entry', 'entries')} here, one a dimension, but this has {len(values)}", node.column
+        )
     if node.operation == "component" and node.details[0] >= values[0].size:
         raise InvalidExpression(f"in dimension {values[0].size}, component {node.details[0]}, counted from 0, does not exist", node.column)
     return operation.apply(*values, *node.details)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from consat.errors import counted
 from consat.network.environment import prepare_own
 from consat.terminal import DONE, estimates_option, full_option, json_option, located, out_option, scenario_argument, set_option, tell
 
@@ -149,7 +150,7 @@ def agent(
     manner = Manner(mode, rate, pace, rounds, memory, math.inf if give_up is None else give_up, report)
     position = around["position"]
     if position is not None and len(position) != part.team.dimension:
-        raise click.UsageError(f"--position has {len(position)} numbers, but must have {part.team.dimension}")
+        raise click.UsageError(f"--position has {counted(len(position), 'number')}, but must have {part.team.dimension}")
     run_agent(
         part, manner, Circumstances(speed=math.inf if speed is None else speed, keys=_keys(keys, scenario, [agent]), **around)
     )  # fmt: skip

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from consat.errors import counted
+
 
 @click.command()
 @click.argument("agents", nargs=-1, required=True, metavar="FILE | ID…")
@@ -23,7 +25,7 @@ def keys(agents: tuple[str, ...], out: Path, addresses: tuple[str, ...], days: i
 
     ids = _ids(agents, overrides)
     make(ids, out, addresses=addresses, days=days, replace=replace)
-    click.echo(f"keys of {len(ids)} agents written to {out}", err=True)
+    click.echo(f"keys of {counted(len(ids), 'agent')} written to {out}", err=True)
     click.echo(f"give each agent its own folder, and nobody {out / CA_KEY}: who has it can be any agent", err=True)
 
 

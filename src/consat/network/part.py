@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import Field, StringConstraints, ValidationError
 
-from consat.errors import AT_KEY, Fault, InvalidSettings, closest, shown
+from consat.errors import AT_KEY, Fault, InvalidSettings, closest, counted, shown
 from consat.numerics import float64
 from consat.objective import Nu
 from consat.scenario import Scenario, dump
@@ -347,10 +347,10 @@ def _unfit(frame: _File, team: Team, settings: Settings) -> Iterator[Fault]:
     if set(frame.first) != set(team.ids):
         yield Fault(("first",), f"first must have the agents of the scenario within, {', '.join(team.ids)}")
     if len(frame.center) != team.dimension:
-        yield Fault(("center",), f"it has {len(frame.center)} numbers, but must have {team.dimension}, one for each dimension")
+        yield Fault(("center",), f"it has {counted(len(frame.center), 'number')}, but must have {team.dimension}, one for each dimension")
     for agent, row in frame.first.items():
         if len(row) != team.dimension:
-            yield Fault(("first", agent), f"it has {len(row)} numbers, but must have {team.dimension}, one for each dimension")
+            yield Fault(("first", agent), f"it has {counted(len(row), 'number')}, but must have {team.dimension}, one for each dimension")
     if frame.agent not in team.ids:
         yield Fault(("agent",), f"agent {frame.agent!r} is not among the agents of the scenario within")
     elif any(team.ids[owner] != frame.agent for owner in team.owner):
@@ -369,7 +369,7 @@ def _unfit_neighbours(frame: _File, team: Team) -> Iterator[Fault]:
             yield Fault((*path, "id"), f"{neighbour.id!r} is the agent itself or stands here for the second time; keep one")
         known.add(neighbour.id)
         if len(neighbour.degrees) != len(neighbour.shares):
-            yield Fault((*path, "degrees"), f"it has {len(neighbour.degrees)} numbers, but must have one for each of shares")
+            yield Fault((*path, "degrees"), f"it has {counted(len(neighbour.degrees), 'number')}, but must have one for each of shares")
         if unknown := [agent for agent in neighbour.shares if agent not in team.ids]:
             yield Fault((*path, "shares"), f"{unknown[0]!r} is not among the agents of the scenario within")
         elif sorted(neighbour.shares, key=team.ids.index) != list(dict.fromkeys(neighbour.shares)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from consat.central.certificate import bounds
 from consat.central.quadratics import shape_of
-from consat.errors import InvalidInput, InvalidSettings
+from consat.errors import InvalidInput, InvalidSettings, counted
 from consat.estimates import Estimates
 from consat.objective import Schedule
 from consat.protocols import FLOWS, ROUNDS
@@ -127,7 +127,7 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) ->
         low, high = (np.atleast_1d(np.asarray(side, dtype=float)) for side in start.box)
         if len(low) not in (1, d):
             raise InvalidSettings(
-                f"the start box has {len(low)} numbers a side, but must have 1 or {d}, one for each dimension of the team"
+                f"the start box has {counted(len(low), 'number')} a side, but must have 1 or {d}, one for each dimension of the team"
             )
     random = np.random.default_rng(start.seed)
     where = (team.count, d), (copies.count, d)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from typing import Any
 
@@ -11,10 +12,13 @@ from consat.central.certificate import BINDING, bounds
 from consat.numerics import float64
 from consat.runs.preparation import scenario_of, with_auxiliary
 from consat.runs.summary import number
+from consat.scale import scale
 from consat.scenario import Scenario
 from consat.teams.team import Team
 
 SCHEMA = "consat.solve/1"
+PROVEN = 1e-6
+"""A margin that is proven to be so near the best possible, in the team's unit of ψ, is the best possible."""
 
 
 @float64
@@ -27,7 +31,8 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
         auxiliary: as in `run`.
 
     Returns:
-        what ``consat solve --json`` prints (schema consat.solve/1), and ``reasons``: what binds or conflicts, in words.
+        what ``consat solve --json`` prints (schema consat.solve/1): ``proven`` says whether ``bounds`` show that no formation has a better
+        margin, ``reasons`` what binds or conflicts, in words.
     """
     from consat.central.reasons import explain
     from consat.central.reference import max_min
@@ -38,11 +43,14 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
     problem = scenario.team
     optimum = max_min(problem, seed=seed)
     certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
+    proven = certificate.upper is not None and certificate.upper - optimum.margin <= PROVEN * scale(problem).psi
+    optimum = dataclasses.replace(optimum, exact=optimum.exact or proven)
     return {
         "schema": SCHEMA,
         "scenario": scenario.name,
         "margin": number(optimum.margin),
         "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
+        "proven": proven,
         "verdict": certificate.verdict,
         "positions": {agent: [number(x) for x in row] for agent, row in zip(problem.ids, optimum.positions, strict=True)},
         "binding": [

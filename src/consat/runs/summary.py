@@ -20,8 +20,10 @@ from consat.trace import Trace
 SCHEMA = "consat.run/1"
 MOST_LISTED = 10_000
 """Above this many agents the summary leaves out what it says of each."""
-AT_REST = 1e-2
-"""A team whose last positions moved by less than this, in its units of length, counts as arrived."""
+NEAR = 0.05
+"""A formation whose margin is proven to be within this fraction of the best possible is least violating; …"""
+NEARLY = 1e-3
+"""… and so is one within this of it, in ψ, or in the team's unit of ψ where that is less."""
 
 
 def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
@@ -29,7 +31,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     team, position = scenario.team, trace.end
     nu = schedule.final
     margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
-    margin = number(margins.min(initial=np.inf))
+    margin = float(margins.min(initial=np.inf))
     certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
     period = 1.0 if trace.clock == "time" else trace.period
@@ -40,9 +42,9 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "protocol": settings.protocol.kind,
         "estimates": settings.protocol.estimates,
         "seed": settings.start.seed,
-        "status": status_of(trace.ending, trace.moved_lately, margin, certificate.verdict, size.length),
+        "status": status_of(trace.ending, margin, certificate.upper, size.psi),
         "verdict": certificate.verdict,
-        "margin": margin,
+        "margin": number(margin),
         "smooth_margin": number(trace.smooth_margin[-1]),
         "bounds": [number(certificate.lower), None if certificate.upper is None else number(certificate.upper)],
         "satisfied_from": {
@@ -64,14 +66,22 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
     }
 
 
-def status_of(ending: str, moved: float, margin: float | None, verdict: str, length: float) -> str:
-    """How a run ended, for people: `moved` is how far any agent moved lately, `length` the team's unit of length."""
+def status_of(ending: str, margin: float, upper: float | None, psi: float) -> str:
+    """How a run ended; ``least-violating`` is said only where it is proven.
+
+    Args:
+        ending: why the run ended.
+        margin: of the team at the end; not finite where a position is not, +∞ without constraints.
+        upper: proven bound on the best margin that any formation can have, or None.
+        psi: the team's unit of ψ.
+    """
     if ending == "diverged":
         return "diverged"
-    if margin is not None and margin > 0:
+    if margin > 0:
         return "satisfied"
-    arrived = moved <= AT_REST * length
-    return "least-violating" if verdict == "infeasible" and arrived else "not-converged"
+    if upper is None or upper > 0:
+        return "not-converged"
+    return "least-violating" if upper - margin <= max(NEAR * -upper, NEARLY * min(psi, 1.0)) else "not-converged"
 
 
 def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray) -> Mapping[str, Any]:

@@ -302,16 +302,14 @@ class _Asked:
 
 def _row(ready: Prepared, outcome: Outcome) -> dict[str, Any]:
     """What became of one run, in the words of ``run --json``."""
-    tally, margin = outcome.tally, number(outcome.tally.margin)
-    good = margin is not None and margin > 0
-    verdict = "feasible" if good else bounds(ready.team, outcome.positions, ready.schedule.final).verdict
-    moved = tally.drift if tally.done >= 10 else np.inf
+    tally, margin = outcome.tally, outcome.tally.margin
+    certificate = None if margin > 0 else bounds(ready.team, outcome.positions, ready.schedule.final)
     return {
-        "status": status_of(outcome.ending, moved, margin, verdict, ready.size.length),
-        "verdict": verdict,
+        "status": status_of(outcome.ending, margin, None if certificate is None else certificate.upper, ready.size.psi),
+        "verdict": "feasible" if certificate is None else certificate.verdict,
         "ending": outcome.ending,
         "satisfied_from": tally.last_bad + 1 if tally.last_bad < tally.done else None,
-        "margin": margin,
+        "margin": number(margin),
         "smooth_margin": number(tally.smooth_margin),
         "rounds": tally.done,
         "messages": tally.messages,

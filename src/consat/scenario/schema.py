@@ -10,7 +10,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from consat.constraints import KINDS
-from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidTeam, closest, shown
+from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidTeam, closest, counted, shown
 from consat.scenario.document import Document, Path
 from consat.scenario.words import complaints, unknown_key
 from consat.settings import Settings
@@ -98,7 +98,10 @@ def _settings(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Setti
         return Settings()
     for side in settings.start.box or ():
         if isinstance(side, tuple) and isinstance(dimension, int) and len(side) != dimension:
-            message = f"a side of the box has {len(side)} entries, but must have {dimension}, one for each dimension of the team"
+            message = (
+                f"a side of the box has {counted(len(side), 'entry', 'entries')}, but must have {dimension}, "
+                "one for each dimension of the team"
+            )
             faults.add(("start", "box"), message, "start")
     return settings
 

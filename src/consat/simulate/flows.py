@@ -304,5 +304,4 @@ class _Course:
             "messages": None,
             "floats_sent": None,
             "known_from": None,
-            "drift": self.tally.drift,
         }

@@ -235,5 +235,4 @@ class _Course:
             "floats_sent": tally.floats,
             "known_from": tally.last_unknown + 1 if tally.last_unknown < tally.done else None,
             "period": self._period,
-            "drift": tally.drift if tally.done >= CHUNK else np.inf,
         }

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from consat.constraints.record import Fixed, Number, Parameter, Vector
-from consat.errors import Fault, shown
+from consat.errors import Fault, counted, shown
 
 LARGEST = 1e100
 """Numbers beyond this are refused: their squares must stay finite in float64."""
@@ -87,7 +87,7 @@ def vector(value: Any, dimension: int, path: Path, key: str, where: str, faults:
     if not isinstance(entries, list | tuple):
         faults.append(Fault(path, f"{key} is {shown(value)}, but must be a list of {numbers}", where))
     elif dimension and len(entries) != dimension:
-        message = f"{key} has {len(entries)} entries, but must have {dimension}, one for each dimension of the team"
+        message = f"{key} has {counted(len(entries), 'entry', 'entries')}, but must have {dimension}, one for each dimension of the team"
         faults.append(Fault(path, message, where))
     elif bad := [entry for entry in entries if not is_number(entry) or not math.isfinite(entry) or abs(entry) > LARGEST]:
         faults.append(Fault(path, f"{key} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}", where))

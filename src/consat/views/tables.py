@@ -9,6 +9,7 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
+from consat.errors import counted
 from consat.views.words import VERDICT
 
 MOST_ROWS = 30
@@ -25,8 +26,10 @@ ANSWER = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]open[/]"}
 def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
     """The findings of `consat.central.assumptions.report`, for people."""
     clusters = findings["clusters"]
-    shape = f"{findings['count']} agents, {findings['constraint_count']} constraints, {findings['cluster_count']} clusters"
-    yield f"[bold]{escape(name)}[/]: {shape}"
+    shape = [
+        counted(findings[key], noun) for key, noun in (("count", "agent"), ("constraint_count", "constraint"), ("cluster_count", "cluster"))
+    ]
+    yield f"[bold]{escape(name)}[/]: {', '.join(shape)}"
     if clusters is not None and 1 < len(clusters) <= MOST_ROWS:
         yield "  " + "; ".join(escape("{" + ", ".join(cluster[:8]) + (", …" if len(cluster) > 8 else "") + "}") for cluster in clusters)
     table = _table("agent", "constraint", "reads", "curvature", "strict in own position")
@@ -47,10 +50,8 @@ def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
     """The answer of `consat.solve`, for people."""
-    lower, upper = answer["bounds"]
     yield f"[bold]{escape(answer['scenario'])}[/]: {VERDICT[answer['verdict']]}"
-    proven = "nothing better is ruled out" if upper is None else f"proven: none is better than {upper:.6g}"
-    yield f"  best margin {_number(answer['margin'])} (in hand {_number(lower)}; {proven})"
+    yield f"  {_best(answer)}"
     yield f"  {escape(answer['method'])}"
     table = _table("agent", "position", "binds", "multiplier")
     binding: dict[str, list[tuple[str, float]]] = {}
@@ -68,11 +69,24 @@ def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield f"[bold]→[/] {escape(reason)}"
 
 
+def _best(answer: Mapping[str, Any]) -> str:
+    """The margin that was found, and what is proven of it."""
+    upper = answer["bounds"][1]
+    if answer["margin"] is None:
+        return "best margin unbounded"
+    if answer["proven"]:
+        return f"best margin {_number(answer['margin'])}, proven: none is better"
+    return f"best margin found {_number(answer['margin'])}; " + (
+        "no upper bound is proven" if upper is None else f"proven: none is better than {_number(upper)}"
+    )
+
+
 def sweep(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     """The outcome of `consat.sweep`, for people: a row for each combination of values."""
     groups = summary["groups"]
-    each = f", {groups[0]['runs']:,} seeds each" if len(groups) > 1 else ""
-    yield f"[bold]{escape(summary['scenario'])}[/]: {summary['count']:,} runs of {summary['protocol']}{each}, in {summary['seconds']:.1f} s"
+    each = f", {counted(groups[0]['runs'], 'seed')} each" if len(groups) > 1 else ""
+    runs = f"{counted(summary['count'], 'run')} of {summary['protocol']}{each}, in {summary['seconds']:.1f} s"
+    yield f"[bold]{escape(summary['scenario'])}[/]: {runs}"
     flows = groups[0]["messages"] is None
     since = "time to satisfaction, s" if flows else "rounds to satisfaction"
     table = _table(*map(escape, summary["over"]), "satisfied", since, "10 % – 90 %", "margin", "10 % – 90 %")

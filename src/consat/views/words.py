@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from consat.errors import counted
+
 MOST_AGENTS = 10
 """Of how many agents every position is listed; of more, only those with the smallest margins are named."""
 MOST_BINDING, MOST_AXES, MOST_LETTERS = 5, 6, 24
@@ -24,6 +26,8 @@ ENDING = {
     "too stiff": "the run ended early, since the flow became too stiff",
     "interrupted": "the run was interrupted",
 }
+BEST = "max-min"
+"""The protocol that ends at the best margin."""
 VERDICT = {
     "feasible": "feasible: the constraints can all hold",
     "infeasible": "infeasible: proven, the constraints cannot all hold",
@@ -42,7 +46,7 @@ def summary(summary: Mapping[str, Any]) -> str:
 
 def sweep(summary: Mapping[str, Any]) -> str:
     """A sweep in a few lines, a line for each combination of values."""
-    lines = [f"{summary['scenario']}: {summary['count']:,} runs of {summary['protocol']} in {summary['seconds']:.1f} s"]
+    lines = [f"{summary['scenario']}: {counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"]
     for group in summary["groups"]:
         named = ", ".join(f"{path} = {value}" for path, value in group["values"].items()) or "all"
         since, margin = ("none" if group[k] is None else _number(group[k]["mean"]) for k in ("satisfied_from", "margin"))
@@ -64,15 +68,30 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     else:
         yield "satisfied from", "not at the end of the run"
 
+    advice = _advice(summary)
+    if advice:
+        yield "what to do", advice
+
+
+def _advice(summary: Mapping[str, Any]) -> str | None:
+    """What gets a team farther that did not converge, and was not interrupted."""
+    if summary["status"] != "not-converged" or summary.get("ending") == "interrupted":
+        return None
+    settled = summary.get("ending") == "settled"
+    if summary["protocol"] == BEST:
+        return "other starts (--seed) may end better: nothing proves that this is the best" if settled else "give it more rounds (--rounds)"
+    best = f"protocol {BEST} (--protocol {BEST}) goes on until the margin is the best possible"
+    return best if settled else f"{best}; --stop converged, until the team has settled"
+
 
 def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
-    counted = [f"{summary[key]:,} {unit}" for key, unit in (("rounds", "rounds"), ("messages", "messages"), ("floats_sent", "numbers sent"))
-               if summary.get(key) is not None]  # fmt: skip
+    units = ("rounds", "round", "rounds"), ("messages", "message", "messages"), ("floats_sent", "number sent", "numbers sent")
+    effort = [counted(summary[key], *unit) for key, *unit in units if summary.get(key) is not None]
     if summary.get("time") is not None:
-        counted.insert(0, f"until t = {_number(summary['time'])} s")
-    if counted:
-        yield "effort", ", ".join(counted)
+        effort.insert(0, f"until t = {_number(summary['time'])} s")
+    if effort:
+        yield "effort", ", ".join(effort)
 
 
 def _who(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
