@@ -39,6 +39,8 @@ class Trace:
         period: of a round, s; None in continuous time, and where rounds take no time.
         recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
         final: (N, d) everyone's last positions, where not all were recorded.
+        violated: (M,) share of all steps, the start among them, at which each constraint was violated; NaN for those that are not watched,
+            see `consat.simulate.violations`; None where nobody counted.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -63,6 +65,7 @@ class Trace:
     period: float | None = None
     recorded: np.ndarray | None = None
     final: np.ndarray | None = None
+    violated: np.ndarray | None = None
     file: Path | None = None
 
     @property

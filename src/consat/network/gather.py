@@ -14,6 +14,7 @@ import numpy as np
 from consat.estimates import Estimates
 from consat.network.fleet import Event
 from consat.objective import Nu, Objective
+from consat.simulate.violations import shares_of
 from consat.teams.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
@@ -169,6 +170,7 @@ class Observer:
             floats_sent=sent["floats"],
             known_from=int(known) if known is not None and self.clock == "round" else None,
             seconds=seconds,
+            violated=shares_of(self.team, position),
         )
 
     def _begin(self) -> float:

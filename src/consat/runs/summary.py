@@ -58,8 +58,9 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "messages": trace.messages,
         "floats_sent": trace.floats_sent,
         "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
-        "agents": _agents(team, margins, multipliers) if listed else None,
+        "agents": _agents(team, margins, multipliers, trace.violated) if listed else None,
         "clusters": _clusters(team, trace.cluster) if listed else None,
+        "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
@@ -84,14 +85,26 @@ def status_of(ending: str, margin: float, upper: float | None, psi: float) -> st
     return "least-violating" if upper - margin <= max(NEAR * -upper, NEARLY * min(psi, 1.0)) else "not-converged"
 
 
-def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray) -> Mapping[str, Any]:
+def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray, violated: np.ndarray | None) -> Mapping[str, Any]:
+    violated = np.full(len(margins), np.nan) if violated is None else violated
     agents: dict[str, Any] = {agent: {"margin": None, "constraints": []} for agent in team.ids}
-    for owner, name, margin, multiplier in zip(team.owner, team.names, margins, multipliers, strict=True):
+    for owner, name, margin, multiplier, share in zip(team.owner, team.names, margins, multipliers, violated, strict=True):
         agent = agents[team.ids[owner]]
         value = number(margin)
-        agent["constraints"].append({"name": name, "margin": value, "multiplier": number(multiplier)})
+        told = {"name": name, "margin": value, "multiplier": number(multiplier), "violated_share": number(share)}
+        agent["constraints"].append(told)
         agent["margin"] = value if agent["margin"] is None or value is None else min(agent["margin"], value)
     return agents
+
+
+def _on_the_way(team: Team, violated: np.ndarray) -> Mapping[str, Any]:
+    """Of the constraints that may keep out of something: how many there are, how many were violated at any time, and the worst of them."""
+    watched, ever = int(np.count_nonzero(~np.isnan(violated))), int(np.count_nonzero(violated > 0))
+    worst = None
+    if ever:
+        k = int(np.nanargmax(violated))
+        worst = {"agent": team.ids[team.owner[k]], "constraint": team.names[k], "violated_share": float(violated[k])}
+    return {"watched": watched, "violated": ever, "worst": worst}
 
 
 def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:

@@ -224,7 +224,7 @@ def _row(chunk: Chunk, place: int) -> Chunk:
 @functools.cache
 def _compiled() -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
     def nobody() -> Chosen:
-        return Chosen(jnp.zeros(0, jnp.int32), jnp.zeros(0, jnp.int32))
+        return Chosen(*(jnp.zeros(0, jnp.int32) for _ in range(3)))
 
     def begin(plan: _Plan, fixed: Any, varied: _Varied, first: Array, keys: Array) -> Any:
         return jax.vmap(lambda varied, first, key: start(*plan.merged(fixed, varied), nobody(), first, key))(varied, first, keys)

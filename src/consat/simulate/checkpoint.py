@@ -52,12 +52,12 @@ class Checkpoint:
 
         Args:
             state: a pytree of arrays.
-            tally: counts, as plain data.
+            tally: counts, as plain data and arrays.
             problem: `fingerprint` of what is run.
         """
         began = time.monotonic()
         arrays = {name: np.asarray(_plain(leaf)) for name, leaf in _named(state).items()}
-        meta = json.dumps({"schema": SCHEMA, "problem": problem, "tally": dict(tally), **self.about})
+        meta = json.dumps({"schema": SCHEMA, "problem": problem, "tally": dict(tally), **self.about}, default=np.ndarray.tolist)
         part = self.path.with_name(self.path.name + ".part")
         with part.open("wb") as file:
             np.savez(file, allow_pickle=False, **{_META: np.frombuffer(meta.encode(), dtype=np.uint8)}, **arrays)

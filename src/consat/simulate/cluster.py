@@ -165,6 +165,7 @@ class ManyProcesses:
             messages=messages.sum(axis=0).astype(np.int64),
             floats=floats.sum(axis=0).astype(np.int64),
             drift=drift[:, :count].max(),
+            violated=None,
             kept=Kept(people[..., :d], people[..., d], rows),
         )
 

@@ -16,6 +16,7 @@ from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
 from consat.simulate.kernel import Now, Seen, World, begin, one_round, see
 from consat.simulate.recording import Choice
+from consat.simulate.violations import violated
 
 CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
@@ -52,6 +53,7 @@ class Chunk(NamedTuple):
         messages: (CHUNK,) sent.
         floats: (CHUNK,) sent.
         drift: how far any position was, on any axis, from where it was before; not finite if a position is not.
+        violated: (W,) after how many of them each watched constraint was violated; None where nobody counts.
         kept: of every so manieth round, with a leading axis; what stands beyond these means nothing.
     """
 
@@ -62,6 +64,7 @@ class Chunk(NamedTuple):
     messages: Any
     floats: Any
     drift: Any
+    violated: Any
     kept: Kept
 
 
@@ -103,20 +106,23 @@ class Engine(Protocol):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Chosen:
-    """Who is recorded.
+    """Who is recorded, and what is watched.
 
     Attributes:
         agents: (R,), or None for all in order.
         copies: (E,).
+        watched: (W,) constraints.
     """
 
     agents: Array | None
     copies: Array
+    watched: Array
 
     @classmethod
     def of(cls, choice: Choice) -> Chosen:
         agents = None if choice.everyone else jnp.asarray(choice.agents)
-        return cls(agents, jnp.asarray(np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)))
+        copies = np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)
+        return cls(agents, jnp.asarray(copies), jnp.asarray(choice.watched))
 
     def of_seen(self, seen: Seen) -> Kept:
         position, margin = (values if self.agents is None else values[self.agents] for values in (seen.position, seen.agent_margin))
@@ -136,7 +142,8 @@ def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Arr
     now, seen = begin(protocol, world, first, key)
     kept = Kept(*(jnp.expand_dims(leaf, 0) for leaf in chosen.of_seen(seen)))
     scalars = {name: getattr(seen, name)[None] for name in SCALARS}
-    return now, Chunk(jnp.asarray(1), **scalars, drift=jnp.max(jnp.abs(now.body), initial=0.0), kept=kept)
+    count = violated(world.observer, chosen.watched, now.body).astype(jnp.asarray(0).dtype)
+    return now, Chunk(jnp.asarray(1), **scalars, drift=jnp.max(jnp.abs(now.body), initial=0.0), violated=count, kept=kept)
 
 
 class Ask(NamedTuple):
@@ -163,6 +170,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         messages=jnp.zeros(CHUNK, whole),
         floats=jnp.zeros(CHUNK, whole),
         drift=jnp.zeros((), real),
+        violated=jnp.zeros(len(chosen.watched), whole),
         kept=Kept(
             jnp.zeros((capacity, recorded, d), real),
             jnp.zeros((capacity, recorded), real),
@@ -178,11 +186,12 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
             name: jax.lax.dynamic_update_index_in_dim(getattr(chunk, name), value, at.done, 0)
             for name, value in zip(SCALARS, seen, strict=True)
         }
+        count = chunk.violated + violated(world.observer, chosen.watched, now.body).astype(whole)
         # what is not to be kept is overwritten by the next
         kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
         places = jnp.where((ask.number + at.done + 1) % ask.every == 0, at.places + 1, at.places)
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
-        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, drift=drift, kept=kept))
+        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, drift=drift, violated=count, kept=kept))
 
     def goes_on(at: _Loop) -> Array:
         return (at.done < ask.rounds) & (at.streak < ask.hold)

@@ -20,6 +20,7 @@ from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink
+from consat.simulate.violations import shares, violated
 from consat.teams.team import Team
 from consat.trace import Ending, Trace, satisfied_from
 
@@ -91,18 +92,20 @@ class Observer:
         own: (N,) rows of own positions.
         agents: (R,) who is recorded, or None for all in order.
         copies: (E,) rows recorded, or None where estimates are not.
+        watched: (W,) constraints of which it is counted how often they are violated.
     """
 
     objective: Objective
     own: Array
     agents: Array | None
     copies: Array | None
+    watched: Array
 
     @classmethod
     def of(cls, team: Team, estimates: Estimates, choice: Choice) -> Observer:
         agents = None if choice.everyone else jnp.asarray(choice.agents)
         copies = None if choice.copies is None else jnp.asarray(choice.copies.astype(np.int32))
-        return cls(Objective.at_positions(team), jnp.asarray(estimates.own), agents, copies)
+        return cls(Objective.at_positions(team), jnp.asarray(estimates.own), agents, copies, jnp.asarray(choice.watched))
 
     def look(self, flow: Flow, problem: Problem, time: Array, state: State) -> Rows:
         """The record of a time."""
@@ -125,9 +128,9 @@ def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> Sta
 
 
 @functools.cache
-def _advance() -> Callable[..., tuple[Rows, State, Array, Array]]:
-    """The compiled integration, from ``times[0]``: the record of ``times[1:]``, the state at the last of them, whether all went well, and
-    how far any position was from where it was at the start."""
+def _advance() -> Callable[..., tuple[Rows, Array, State, Array, Array]]:
+    """The compiled integration, from ``times[0]``: the record of ``times[1:]``, which watched constraints are violated there, the state at
+    the last of them, whether all went well, and how far any position was from where it was at the start."""
     import diffrax
     import optimistix
 
@@ -137,12 +140,13 @@ def _advance() -> Callable[..., tuple[Rows, State, Array, Array]]:
         # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
         return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
 
-    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> tuple[Rows, State, Array, Array]:
+    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> tuple[Rows, Array, State, Array, Array]:
         anchor = state.x[observer.own]
 
-        def look(t: Array, y: State, _: Any) -> tuple[Rows, Array]:
-            moved = jnp.max(jnp.abs(y.x[observer.own] - anchor), initial=0.0)
-            return observer.look(flow, problem, jnp.asarray(t), y), moved
+        def look(t: Array, y: State, _: Any) -> tuple[Rows, Array, Array]:
+            at = y.x[observer.own]
+            moved = jnp.max(jnp.abs(at - anchor), initial=0.0)
+            return observer.look(flow, problem, jnp.asarray(t), y), moved, violated(observer.objective, observer.watched, at)
 
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, _: rate(flow, problem, jnp.asarray(t), y)),
@@ -156,10 +160,11 @@ def _advance() -> Callable[..., tuple[Rows, State, Array, Array]]:
             max_steps=MOST_STEPS,
             throw=False,
         )
-        (seen, moved), last = solution.ys
+        (seen, moved, wrong), last = solution.ys
         # where the solver did not get
         seen = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(moved).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan), seen)
-        return seen, jax.tree.map(lambda leaf: leaf[-1], last), solution.result == diffrax.RESULTS.successful, jnp.max(moved)
+        wrong &= jnp.isfinite(moved)[:, None]
+        return seen, wrong, jax.tree.map(lambda leaf: leaf[-1], last), solution.result == diffrax.RESULTS.successful, jnp.max(moved)
 
     return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
 
@@ -208,7 +213,7 @@ def simulate_flow(
     grid = np.linspace(0.0, end, max(round(end / SAMPLE), 1) + 1)
     problem, observer = Problem.of(team, estimates, schedule), Observer.of(team, estimates, choice)
     known = "" if checkpoint is None else fingerprint(team, flow, schedule, first, estimates.layout, float(grid[1]))
-    course = _Course(flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
+    course = _Course(team, flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
     return follow(course, estimates, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=known, progress=progress)
 
 
@@ -220,20 +225,23 @@ class _Tally(Steps):
         time: of the last sample, s.
         satisfied_from: the time after the last at which the margin was ≤ 0, interpolated; None if the last margin is.
         good: for how many samples on end the margin has been positive.
+        violated: (W,) at how many samples each watched constraint was violated.
     """
 
     time: float = 0.0
     satisfied_from: float | None = None
     good: int = 0
+    violated: Any = 0
 
-    def add(self, rows: Rows, moved: float = np.inf) -> None:
-        """Count some samples."""
+    def add(self, rows: Rows, violated: Any, moved: float = np.inf) -> None:
+        """Count some samples, K of them, at which each watched constraint is `violated`, (K, W), or not."""
         count, first = len(rows.step), self.done < 0
         at, margin = (rows.step, rows.margin) if first else (np.append(self.time, rows.step), np.append(self.margin, rows.margin))
         bad = np.flatnonzero(~(rows.margin > 0))
         self.good = count - 1 - int(bad[-1]) if len(bad) else self.good + count
         if first or len(bad) or (self.satisfied_from is None):
             self.satisfied_from = satisfied_from(at, margin, interpolate=True)
+        self.violated = np.asarray(self.violated) + np.sum(violated, axis=0)
         self.done += count
         self.time, self.margin, self.drift = float(rows.step[-1]), float(rows.margin[-1]), moved
 
@@ -242,6 +250,7 @@ class _Tally(Steps):
 class _Course:
     """A flow, for `consat.simulate.loop`; `grid` are the times of all samples, the rest is as in `simulate_flow`."""
 
+    team: Team
     flow: Flow
     problem: Problem
     observer: Observer
@@ -257,17 +266,17 @@ class _Course:
     def start(self) -> tuple[State, Rows]:
         state = self.flow.start(jnp.asarray(self.first))
         rows = self.look(state)
-        self.tally.add(rows)
+        self.tally.add(rows, violated(self.observer.objective, self.observer.watched, state.x[self.observer.own])[None])
         return state, rows
 
     def advance(self, state: State, every: int) -> tuple[State, Rows, Ending | None]:
         done = self.tally.done
         times = self.grid[done : done + CHUNK + 1]
         padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
-        seen, state, fine, moved = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
+        seen, wrong, state, fine, moved = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
         count = len(times) - 1
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], seen)._replace(step=times[1:])
-        self.tally.add(rows, float(moved))
+        self.tally.add(rows, np.asarray(wrong)[:count], float(moved))
         rows = rows.where(np.arange(done + 1, done + 1 + count) % every == 0)
         if fine:
             return state, rows, self._ending(state)
@@ -304,4 +313,5 @@ class _Course:
             "messages": None,
             "floats_sent": None,
             "known_from": None,
+            "violated": shares(self.team, self.tally.violated, self.tally.done + 1),
         }

@@ -18,7 +18,7 @@ from consat.trace import Ending, Trace
 
 @dataclass
 class Steps:
-    """What is counted as a run goes on; plain numbers, which a checkpoint holds.
+    """What is counted as a run goes on; numbers, and arrays of them, which a checkpoint holds.
 
     Attributes:
         done: steps after the first: rounds, or samples of a flow.

@@ -13,6 +13,7 @@ import numpy as np
 
 from consat.errors import InvalidSettings, closest
 from consat.estimates import Estimates
+from consat.simulate.violations import watched
 from consat.teams.team import Team
 
 MOST_AGENTS = 10_000
@@ -68,12 +69,14 @@ class Choice:
         copies: (E,) which rows of the state, or None.
         every: each how manieth step; the first and the last are kept in any case.
         everyone: whether that is the whole team.
+        watched: (W,) constraints of which it is counted how often they are violated.
     """
 
     agents: np.ndarray
     copies: np.ndarray | None
     every: int
     everyone: bool
+    watched: np.ndarray
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, who: Who = None, estimates: bool | None = None, every: int = 1) -> Choice:
@@ -98,7 +101,7 @@ class Choice:
         if not everyone:
             rows = np.flatnonzero(np.isin(copies.holder, agents) & np.isin(copies.position, agents))
         keep = len(rows) * team.dimension <= MOST_ESTIMATES if estimates is None else estimates
-        return cls(agents, rows if keep else None, every, everyone)
+        return cls(agents, rows if keep else None, every, everyone, watched(team))
 
 
 def _agents(team: Team, who: Who) -> np.ndarray:

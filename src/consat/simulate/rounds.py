@@ -21,6 +21,7 @@ from consat.simulate.engine import CHUNK, Chunk, Engine, Kept, OneProcess
 from consat.simulate.kernel import Body, Weather, world_of
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink, velocities
+from consat.simulate.violations import shares
 from consat.teams.team import Team
 from consat.trace import Ending, Trace
 
@@ -48,6 +49,7 @@ class Tally(Steps):
         floats: sent.
         smooth_margin: the last.
         asked: the round at which it was last asked whether there is hope.
+        violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
     """
 
     streak: int = 0
@@ -57,6 +59,7 @@ class Tally(Steps):
     floats: int = 0
     smooth_margin: float = np.nan
     asked: int = 0
+    violated: Any = 0
 
     def add(self, chunk: Chunk) -> np.ndarray:
         """Count some rounds; gives their numbers."""
@@ -69,6 +72,7 @@ class Tally(Steps):
         self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
         self.messages += int(np.sum(np.asarray(chunk.messages)[:count]))
         self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
+        self.violated = None if chunk.violated is None else np.asarray(self.violated) + np.asarray(chunk.violated)
         self.done += count
         self.margin, self.smooth_margin = float(margin[-1]), float(chunk.smooth_margin[count - 1])
         self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
@@ -141,7 +145,7 @@ def simulate_rounds(
         hopeless=hopeless, enough=enough,
     )  # fmt: skip
     problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
-    course = _Course(engine, rules, choice, body)
+    course = _Course(team, engine, rules, choice, body)
     return follow(course, copies, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=problem, progress=progress)
 
 
@@ -189,14 +193,15 @@ class _Course:
     """Rounds, for `consat.simulate.loop`.
 
     Args:
+        team: who runs.
         engine: who carries them out.
         rules: when they end.
         choice: what is recorded.
         body: see `simulate_rounds`.
     """
 
-    def __init__(self, engine: Engine, rules: Rules, choice: Choice, body: Body | None) -> None:
-        self._engine, self._rules, self._choice = engine, rules, choice
+    def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None) -> None:
+        self._team, self._engine, self._rules, self._choice = team, engine, rules, choice
         self._period = None if body is None else 1.0 / body.rate
         self.tally, self.end = Tally(every=choice.every), rules.end
         self.agree, self.positions = engine.agree, engine.positions
@@ -235,4 +240,5 @@ class _Course:
             "floats_sent": tally.floats,
             "known_from": tally.last_unknown + 1 if tally.last_unknown < tally.done else None,
             "period": self._period,
+            "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
         }

@@ -10,7 +10,7 @@ from consat.errors import counted
 
 MOST_AGENTS = 10
 """Of how many agents every position is listed; of more, only those with the smallest margins are named."""
-MOST_BINDING, MOST_AXES, MOST_LETTERS = 5, 6, 24
+MOST_BINDING, MOST_VIOLATED, MOST_AXES, MOST_LETTERS = 5, 3, 6, 24
 SLIGHT = 0.01
 """Constraints with a smaller multiplier don't bind."""
 
@@ -68,9 +68,36 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     else:
         yield "satisfied from", "not at the end of the run"
 
+    way = summary.get("on_the_way")
+    if way is not None and way["violated"] and summary["status"] != "diverged":
+        yield "on the way", _way(summary, way)
     advice = _advice(summary)
     if advice:
         yield "what to do", advice
+
+
+def _way(summary: Mapping[str, Any], way: Mapping[str, Any]) -> str:
+    """The constraints that were violated for the largest share of a run, whatever its end."""
+    worst = way["worst"]
+    told = [(worst["violated_share"], worst["agent"], worst["constraint"])]
+    if summary.get("agents") is not None:
+        told = [
+            (constraint["violated_share"], agent, constraint["name"])
+            for agent, entry in summary["agents"].items()
+            for constraint in entry["constraints"]
+            if constraint["violated_share"]
+        ]
+    told.sort(key=lambda each: -each[0])
+    (share, agent, name), *others = told[:MOST_VIOLATED]
+    first = f"{_short(agent)}: {_short(name)} violated for {_share(share)} of the run"
+    named = ", ".join([first, *(f"{_short(agent)}: {_short(name)} for {_share(share)}" for share, agent, name in others)])
+    left = way["violated"] - min(len(told), MOST_VIOLATED)
+    more = f", and {left:,} more" if left else ""
+    return named + more
+
+
+def _share(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else "less than 1%"
 
 
 def _advice(summary: Mapping[str, Any]) -> str | None:
