@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from consat.errors import InvalidSettings
-from consat.graphs import cluster_links, clusters, holders, require_connected
+from consat.graphs import clusters, holders, relays, require_connected
 from consat.numerics import Groups, pick
 from consat.teams.family import distinct
 from consat.teams.team import Team
@@ -78,10 +78,9 @@ class Estimates:
             raise InvalidSettings(f"estimates is {layout!r}, but must be one of {', '.join(get_args(Layout))}")
         require_connected(team)
         cluster = clusters(team)
-        pairs = holders(team, cluster) if layout == "local" else _everyone(cluster)
-        links = cluster_links(team, cluster)
+        pairs = holders(team, cluster) if layout == "local" else _everyone(team, cluster)
         own = np.flatnonzero(pairs[:, 0] == pairs[:, 1]).astype(np.int32)
-        edges = _shared(pairs, links, team.count)
+        edges = _shared(pairs, team.links, team.count)
         return cls(layout, pairs[:, 0], pairs[:, 1], own, edges, cluster, _used(pairs[edges, 0], team.count))
 
     @property
@@ -109,10 +108,13 @@ class Estimates:
         return Exchange(jnp.asarray(sender), Groups.of(receiver, self.count // block), block)
 
 
-def _everyone(cluster: np.ndarray) -> np.ndarray:
+def _everyone(team: Team, cluster: np.ndarray) -> np.ndarray:
+    """Pairs (holder, position): every agent holds every position of its cluster, and relays those of the clusters that they join."""
     order = np.argsort(cluster, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1)
-    pairs = np.concatenate([np.stack([np.repeat(group, len(group)), np.tile(group, len(group))], axis=1) for group in members])
+    holding = [(group, group) for group in members]
+    holding += [(np.array(sorted(joining)), members[c]) for c, joining in relays(team, cluster).items()]
+    pairs = np.concatenate([np.stack([np.repeat(who, len(whom)), np.tile(whom, len(who))], axis=1) for who, whom in holding])
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int32)
 
 

@@ -50,23 +50,58 @@ def clusters(team: Team) -> np.ndarray:
 
 
 def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
-    """The links that carry anything: those inside a cluster; (L', 2) int32."""
+    """The links inside a cluster; (L', 2) int32."""
     return team.links[cluster[team.links[:, 0]] == cluster[team.links[:, 1]]]
 
 
 def disconnected(team: Team) -> list[list[list[str]]]:
-    """The clusters whose agents cannot reach one another over the links inside them (Assumption 1).
+    """The clusters whose agents cannot reach one another (Assumption 1): neither over the links inside them nor through `relays`.
 
     Returns:
-        for each such cluster its connected parts, each a list of ids.
+        for each such cluster its parts, connected by links inside it, each a list of ids.
     """
     cluster = clusters(team)
+    part, broken = _broken(team, cluster)
+    joined = relays(team, cluster)
+    parts = [
+        [np.flatnonzero((cluster == c) & (part == p)) for p in np.unique(part[cluster == c])] for c in broken.tolist() if c not in joined
+    ]
+    return [[[team.ids[int(i)] for i in members] for members in of_cluster] for of_cluster in parts]
+
+
+def _broken(team: Team, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) which agents reach one another over links inside their cluster, and the clusters that fall into several such parts."""
     part = _components(cluster_links(team, cluster), team.count)
     first = np.full(cluster.max() + 1, -1)
     first[cluster[::-1]] = part[::-1]
-    broken = np.unique(cluster[part != first[cluster]])
-    parts = [[np.flatnonzero((cluster == c) & (part == p)) for p in np.unique(part[cluster == c])] for c in broken]
-    return [[[team.ids[int(i)] for i in members] for members in of_cluster] for of_cluster in parts]
+    return part, np.unique(cluster[part != first[cluster]])
+
+
+def relays(team: Team, cluster: np.ndarray) -> dict[int, set[int]]:
+    """Who passes messages between the parts of a cluster that the links inside it leave in pieces.
+
+    Only agents that no constraint has to do with, neither as its owner nor as one that it reads, stand in for a cluster that is not their
+    own: they hold copies of its positions, and add nothing.
+
+    Args:
+        team: the team.
+        cluster: (N,) as `clusters` returns.
+
+    Returns:
+        for each cluster that such agents join, the agents: few, though not always the fewest.
+    """
+    _, broken = _broken(team, cluster)
+    free = (np.bincount(cluster)[cluster] == 1) & (team.constraints_per_agent == 0)
+    if not len(broken) or not free.any():
+        return {}
+    found = {}
+    for c in broken.tolist():
+        allowed = (cluster == c) | free
+        links = team.links[allowed[team.links].all(axis=1)]
+        members = np.flatnonzero(cluster == c)
+        if len(np.unique(_components(links, team.count)[members])) == 1:
+            found[c] = _steiner(int(members[0]), set(members[1:].tolist()), _adjacency(links, team.count))
+    return found
 
 
 def require_connected(team: Team) -> None:
@@ -75,7 +110,8 @@ def require_connected(team: Team) -> None:
     for parts in disconnected(team):
         shown = " and ".join("{" + ", ".join(part[:5]) + (", …" if len(part) > 5 else "") + "}" for part in parts[:4])
         cure = f"add a link such as [{parts[0][0]}, {parts[1][0]}]"
-        message = f"the constraints tie {shown} together, but no path of links inside their cluster joins them (Assumption 1); {cure}"
+        message = f"the constraints tie {shown} together, but no path of links inside their cluster joins them (Assumption 1), "
+        message += f"nor one over agents without constraints; {cure}"
         faults.append(Fault(("communication",), message, "communication"))
     if faults:
         raise InvalidTeam(faults)
@@ -140,10 +176,10 @@ def middles(count: int, links: np.ndarray) -> np.ndarray:
 
 def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
     """Who holds a copy of whose position under local estimates: i holds x_j if some ψ of i reads x_j, j holds its own, and relays
-    hold it where the links among these alone would leave them in pieces.
+    hold it where the links among these alone would leave them in pieces: agents of the same cluster or, where that has none, `relays`.
 
     Args:
-        team: whose clusters are connected by links.
+        team: whose clusters are connected.
         cluster: (N,) as `clusters` returns.
 
     Returns:
@@ -151,12 +187,13 @@ def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
     """
     own = np.arange(team.count, dtype=np.int32)
     pairs = _unique_pairs(np.concatenate([_reads(team), np.stack([own, own], axis=1)]), team.count)
-    relays = list(_relays(pairs, cluster_links(team, cluster), team.count))
-    return _unique_pairs(np.concatenate([pairs, *relays]), team.count) if relays else pairs
+    further = list(_further(team, cluster, pairs))
+    return _unique_pairs(np.concatenate([pairs, *further]), team.count) if further else pairs
 
 
-def _relays(pairs: np.ndarray, links: np.ndarray, count: int) -> Iterator[np.ndarray]:
+def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.ndarray]:
     """Extra (holder, position) pairs. Positions whose readers are all linked to their owner need none, and cost no loop."""
+    count, links = team.count, cluster_links(team, cluster)
     foreign = pairs[pairs[:, 0] != pairs[:, 1]]
     known = _keys(links, count)  # sorted, as links are
     wanted = _keys(np.stack([foreign.min(axis=1), foreign.max(axis=1)], axis=1), count)
@@ -164,12 +201,21 @@ def _relays(pairs: np.ndarray, links: np.ndarray, count: int) -> Iterator[np.nda
     remote = np.unique(foreign[~linked, 1])
     if not len(remote):
         return
-    neighbours = _adjacency(links, count)
+    inside, outside = _adjacency(links, count), relays(team, cluster)
+    around = {c: _adjacency(_among(team, cluster, c, joining), count) for c, joining in outside.items()}
     by_position = foreign[np.argsort(foreign[:, 1], kind="stable")]
     starts = np.searchsorted(by_position[:, 1], remote), np.searchsorted(by_position[:, 1], remote, side="right")
     for position, begin, end in zip(remote, *starts, strict=True):
+        neighbours = around.get(int(cluster[position]), inside)
         path_holders = _steiner(int(position), set(map(int, by_position[begin:end, 0])), neighbours)
         yield np.array([(holder, position) for holder in path_holders], dtype=np.int32).reshape(-1, 2)
+
+
+def _among(team: Team, cluster: np.ndarray, c: int, joining: set[int]) -> np.ndarray:
+    """The links among the agents of a cluster and those that join its parts."""
+    allowed = cluster == c
+    allowed[list(joining)] = True
+    return team.links[allowed[team.links].all(axis=1)]
 
 
 def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> set[int]:

@@ -9,8 +9,11 @@ import pytest
 
 import consat as cs
 from consat import graphs
-from consat.estimates import Estimates
+from consat.central.assumptions import report
+from consat.estimates import Estimates, Layout
+from consat.network.part import split
 from consat.numerics import float64
+from consat.views import tables
 
 
 def example() -> cs.Team:
@@ -40,8 +43,64 @@ def test_disconnected_cluster_is_named_with_a_cure() -> None:
 
 
 def test_links_through_another_cluster_do_not_count() -> None:
-    agents = [cs.Agent("a", [cs.near("b", 1)]), cs.Agent("b"), cs.Agent("relay")]
-    assert graphs.disconnected(cs.Team(agents, links=[("a", "relay"), ("relay", "b")]))
+    tied = [cs.Agent("a", [cs.near("b", 1)]), cs.Agent("b")]
+    links = [("a", "c"), ("c", "b")]
+    assert graphs.disconnected(cs.Team([*tied, cs.Agent("c", [cs.within([0, 0], 1)])], links=links)) == [[["a"], ["b"]]]
+    # nor through one that another cluster reads
+    read = [cs.Agent("c"), cs.Agent("d", [cs.near("c", 1)])]
+    assert graphs.disconnected(cs.Team([*tied, *read], links=[*links, ("c", "d")])) == [[["a"], ["b"]]]
+
+
+def two_pairs() -> cs.Team:
+    """Two clusters, {a, b} and {c, d}, whose messages pass m; n and o join a and b, too, but over more links; p hangs on loosely."""
+    agents = [
+        cs.Agent("a", [cs.within([0, 0], 1)]), cs.Agent("b", [cs.near("a", 1)]), cs.Agent("m"), cs.Agent("n"), cs.Agent("o"),
+        cs.Agent("c", [cs.within([3, 0], 1)]), cs.Agent("d", [cs.near("c", 1)]), cs.Agent("p"),
+    ]  # fmt: skip
+    return cs.Team(agents, links=[tuple(link) for link in ("am", "mb", "an", "no", "ob", "cm", "md", "pa")])
+
+
+def test_agents_without_constraints_relay_for_clusters_that_their_own_links_leave_in_pieces() -> None:
+    team = two_pairs()
+    cluster = graphs.clusters(team)
+    assert graphs.relays(team, cluster) == {0: {2}, 4: {2}}
+    assert graphs.disconnected(team) == []
+    # who reads whom, and m for both clusters: b reads a, d reads c
+    held = {(team.ids[i], team.ids[j]) for i, j in graphs.holders(team, cluster)}
+    assert held == {(i, i) for i in team.ids} | {("b", "a"), ("m", "a"), ("d", "c"), ("m", "c")}
+    full = Estimates.of(team, "full")
+    held = {(team.ids[i], team.ids[j]) for i, j in zip(full.holder, full.position, strict=True)}
+    assert held == {(i, j) for pair in ("ab", "cd") for i in (*pair, "m") for j in pair} | {(i, i) for i in "mnop"}
+    # a cluster that its own links join asks nobody else
+    joined = cs.Team([cs.Agent("a", [cs.near("b", 1)]), cs.Agent("b"), cs.Agent("m")], links=[("a", "b"), ("a", "m"), ("m", "b")])
+    assert graphs.relays(joined, graphs.clusters(joined)) == {}
+    # nobody joins those that are out of reach
+    apart = cs.Team([cs.Agent("a", [cs.near("b", 1)]), cs.Agent("b"), cs.Agent("m")], links=[("a", "m")])
+    assert graphs.disconnected(apart) == [[["a"], ["b"]]]
+    with pytest.raises(cs.InvalidTeam, match=r"nor one over agents without constraints; add a link such as \[a, b\]"):
+        graphs.require_connected(apart)
+
+
+def test_check_says_who_relays_for_whom() -> None:
+    findings = report(two_pairs())
+    assert findings["communication_connected"]
+    assert findings["relays"] == [{"agent": "m", "for": ["a", "b"]}, {"agent": "m", "for": ["c", "d"]}]
+    text = "\n".join(part for part in tables.check("pairs", findings) if isinstance(part, str))
+    assert "m relays for {a, b}. m relays for {c, d}." in text
+    assert report(example())["relays"] == []
+
+
+@pytest.mark.parametrize("layout", ["full", "local"])
+def test_a_team_that_needs_a_relay_is_satisfied(layout: Layout) -> None:
+    team = two_pairs()
+    summary = cs.run(team, estimates=layout, seed=1, loss=0.3).summary
+    assert summary["status"] == "satisfied"
+    assert summary["clusters"] == [["a", "b"], ["m"], ["n"], ["o"], ["c", "d"], ["p"]]
+    assert summary["agents"]["m"] == {"margin": None, "constraints": []}
+    # on the network m gets copies, too, and constraints of nobody
+    part = split(cs.loads(cs.dump(team)), run="pairs")["m"]
+    assert set(part.team.ids) == {"m", "a", "c"}
+    assert not len(part.team.owner)
 
 
 @pytest.mark.parametrize("kind", ["line", "ring", "star", "complete"])

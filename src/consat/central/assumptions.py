@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from consat.central.quadratics import Floats, Ints, expand, shape_of
 from consat.central.recession import Recession, recession
 from consat.constraints.library import within
-from consat.graphs import clusters, disconnected
+from consat.graphs import clusters, disconnected, relays
 from consat.scale import scale
 from consat.teams.family import Family
 from consat.teams.team import Team
@@ -39,7 +39,7 @@ def report(team: Team) -> dict[str, Any]:
     shape, cluster = shape_of(team), clusters(team)
     listed = team.count <= MOST_LISTED
     bounded, unique, adrift = existence(team)
-    parts = disconnected(team)
+    parts, joining = disconnected(team), _relays(team, cluster)
     count = int(cluster.max(initial=-1)) + 1
     return {
         "schema": SCHEMA,
@@ -48,12 +48,13 @@ def report(team: Team) -> dict[str, Any]:
         "clusters": _members(team, cluster, count) if listed else None,
         "cluster_count": count,
         "communication_connected": not parts,
+        "relays": joining if listed else None,
         "constraint_count": len(team.owner),
         "constraints": _constraints(team) if listed else None,
         "convex": bool(shape.concave.all()),
         "unique_optimum": unique,
         "bounded": bounded,
-        "assumptions": [_communication(parts), _one_cluster(count), _compact(team, bounded, adrift)],
+        "assumptions": [_communication(parts, joining), _one_cluster(count), _compact(team, bounded, adrift)],
     }
 
 
@@ -138,12 +139,23 @@ def _constraints(team: Team) -> list[dict[str, Any]]:
     ]
 
 
-def _communication(parts: list[list[list[str]]]) -> dict[str, Any]:
+def _relays(team: Team, cluster: Ints) -> list[dict[str, Any]]:
+    """Who passes on messages of a cluster that is not its own, and the agents of that cluster."""
+    return [
+        {"agent": team.ids[i], "for": [team.ids[int(k)] for k in np.flatnonzero(cluster == c)]}
+        for c, joining in relays(team, cluster).items()
+        for i in sorted(joining)
+    ]
+
+
+def _communication(parts: list[list[list[str]]], joining: list[dict[str, Any]]) -> dict[str, Any]:
+    passing = "".join(f" {relay['agent']} relays for {{{_few(relay['for'])}}}." for relay in joining[:5])
     if not parts:
-        return _assumption(1, True, "Inside every cluster each agent can reach every other over links.")
+        reach = "In every cluster" if joining else "Inside every cluster"
+        return _assumption(1, True, f"{reach} each agent can reach every other over links.{passing}")
     shown = " and ".join("{" + _few(part) + "}" for part in parts[0][:4])
     cure = "; ".join(f"add a link such as [{broken[0][0]}, {broken[1][0]}]" for broken in parts[:5])
-    return _assumption(1, False, f"The constraints tie {shown} together, but no path of links inside their cluster joins them.", cure)
+    return _assumption(1, False, f"The constraints tie {shown} together, but no path of links joins them.", cure)
 
 
 def _one_cluster(count: int) -> dict[str, Any]:
