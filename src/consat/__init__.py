@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from consat import forks
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ _HOME = {
     "teams.groups": ("Group", "each"),
     "teams.team": ("Agent", "Team"),
 }  # fmt: skip
+forks.watch()
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [

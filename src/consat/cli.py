@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 import click
 
 from consat import __version__
-from consat.errors import ConsatError, InvalidInput, InvalidSettings
+from consat.errors import ConsatError, InvalidInput, InvalidSettings, closest
 from consat.network.commands import agent, launch, split
 from consat.network.environment import keep_compilations
 from consat.network.keys_command import keys
@@ -26,6 +26,7 @@ from consat.terminal import (
     UNSATISFIED,
     USAGE,
     estimates_option,
+    force_option,
     full_option,
     json_option,
     located,
@@ -84,9 +85,14 @@ def cli() -> None:
 @cli.command()
 @click.argument("name", required=False)
 def init(name: str | None) -> None:
-    """Write a starting scenario to NAME.yaml; a packaged NAME gives a copy of that one."""
+    """Write a scenario to begin with, to NAME.yaml.
+
+    The name of a packaged scenario gives a copy of that one.
+    """
     from consat.scenario import packaged, packaged_text, template
 
+    if name and not name.endswith((".yaml", ".yml")) and name not in packaged() and (hint := closest(name, packaged())):
+        raise click.UsageError(f"there is no packaged scenario {name!r}{hint} For an empty scenario of that name: consat init {name}.yaml")
     target = Path(name if name and name.endswith((".yaml", ".yml")) else f"{name or 'scenario'}.yaml")
     text = packaged_text(name) if name in packaged() else template()
     try:
@@ -116,6 +122,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @out_option
+@force_option
 @click.option("--every", type=click.IntRange(min=1), default=1, metavar="K", help="Record each K-th round, or sample of a flow.")
 @click.option(
     "--record",
@@ -159,7 +166,7 @@ def run(
     if result.summary["result"] is not None and out is not None:
         figures = result.plot(out)
         if not (quiet or as_json):
-            _say(f"written: {', '.join(str(path) for path in (out / 'result.nc', *figures))}")
+            _say(f"written: {', '.join(map(str, (result.summary['result'], *figures)))}")
     return tell(result, quiet=quiet, as_json=as_json)
 
 
@@ -189,7 +196,10 @@ def _fit_together(scenario: str | None, resume: Path | None, out: Path | None, c
 @set_option
 @json_option
 def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
-    """Check schema, graphs, clusters, the paper's assumptions and the curvature of every constraint."""
+    """Check a scenario: faults, graphs, assumptions, curvature.
+
+    That is its schema, task and communication graph, clusters, the paper's assumptions, and the curvature of every constraint.
+    """
     loaded = _load(scenario, overrides)
     from consat.central.assumptions import report
     from consat.graphs import require_connected
@@ -212,7 +222,10 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @json_option
 def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float | None, as_json: bool) -> int:
-    """Find the best margin centrally, prove it, and say what stands in the way."""
+    """Find the best margin centrally, and prove it.
+
+    Says also what binds, or what stands in the way, and what the least change is that would help.
+    """
     _cache_compilations()
     loaded = _load(scenario, overrides)
     from consat.runs.solving import solve as solve_team
@@ -248,23 +261,34 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write sweep.json, sweep.csv and a figure there."
 )
+@force_option
 @click.option("--full", is_flag=True, help="List every run in the JSON, however many.")
 @json_option
 def sweep(
-    scenario: str, overrides: tuple[str, ...], over: tuple[str, ...], seed: int | None, out: Path | None, as_json: bool, **settings: Any
+    *, scenario: str, overrides: tuple[str, ...], over: tuple[str, ...], seed: int | None,
+    out: Path | None, force: bool, as_json: bool, **settings: Any,
 ) -> int:  # fmt: skip
-    """Run many seeds, and every combination of some values, as one computation."""
+    """Run many seeds and parameter values as one computation.
+
+    Runs every combination of the values, each with every seed.
+    """
     _cache_compilations()
     if wrong := [text for text in over if not all(text.partition("="))]:
         raise click.UsageError(
             f"--over {wrong[0]}: this must be PATH=VALUES, such as loss=0,0.1,0.3 or agents.a1.constraints.0.radius=0.5:2:16"
         )
+    paths = [text.partition("=")[0].strip() for text in over]
+    if repeated := [path for path in paths if paths.count(path) > 1]:
+        raise click.UsageError(f"--over {repeated[0]} is given twice; write all its values in one, {repeated[0]}=v1,v2,…")
     loaded = _load(scenario, (*overrides, *([] if seed is None else [f"start.seed={seed}"])))
     from consat.runs.sweeping import sweep as sweep_team
     from consat.runs.sweeping import values
+    from consat.simulate.files import claim
     from consat.views import tables
 
-    options = {path.strip(): values(text) for path, _, text in (each.partition("=") for each in over)}
+    if out is not None:
+        claim(out, loaded.name, force=force)
+    options = {path: values(text.partition("=")[2]) for path, text in zip(paths, over, strict=True)}
     with _progress(as_json, share=True) as progress, located(loaded):
         found = sweep_team(loaded, options, progress=progress, **settings)
     if out is not None:
@@ -280,10 +304,10 @@ def sweep(
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Where to; beside the result if not given.")
 def plot(result: Path, out: Path | None) -> None:
-    """Draw the figures of a saved RESULT."""
+    """Draw the figures of a saved RESULT, a file or the DIR of a run."""
     from consat.result import Result
 
-    for path in Result.load(result).plot(out or result.parent):
+    for path in Result.load(result).plot(out or _file(result).parent):
         click.echo(path)
 
 
@@ -291,13 +315,20 @@ def plot(result: Path, out: Path | None) -> None:
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="GIF", help="Where to; beside the result if not given.")
 def animate(result: Path, out: Path | None) -> None:
-    """Make an animated GIF of a saved RESULT."""
+    """Make a GIF of a saved RESULT, a file or the DIR of a run."""
     from consat.result import Result
     from consat.views import animation
 
     loaded = Result.load(result)
     with _progress(quiet=False) as progress:
-        click.echo(animation.save(loaded, out or result.with_suffix(".gif"), progress=lambda done: progress(done, None)))
+        click.echo(animation.save(loaded, out or _file(result).with_suffix(".gif"), progress=lambda done: progress(done, None)))
+
+
+def _file(result: Path) -> Path:
+    """The result file, where the directory of a run may be given for it."""
+    from consat.result import RESULT
+
+    return result / RESULT if result.is_dir() else result
 
 
 for command in (split, agent, launch, keys):

@@ -32,6 +32,17 @@ def axis_names(dimension: int) -> list[str]:
     return [AXES[k] if dimension <= len(AXES) else f"x{k + 1}" for k in range(dimension)]
 
 
+def attribute(path: Path, name: str) -> str:
+    """An attribute of a result file.
+
+    Raises:
+        OSError: this is no such file.
+        KeyError: it has no such attribute.
+    """
+    with h5netcdf.File(path, "r") as file:
+        return str(file.attrs[name])
+
+
 def write(
     path: Path,
     clock: str,

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat import forks
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -25,10 +27,14 @@ UNROLLED = 16
 
 
 def float64(function: Callable[P, T]) -> Callable[P, T]:
-    """Run `function` with JAX in double precision, and leave the caller's own JAX settings as they were."""
+    """Run `function` with JAX in double precision, and leave the caller's own JAX settings as they were.
+
+    It raises a `consat.ConsatError` in a process in which JAX cannot compute; see `consat.forks`.
+    """
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        forks.refuse()
         with jax.enable_x64(True):
             return function(*args, **kwargs)
 

@@ -19,6 +19,8 @@ from consat.trace import Trace
 if TYPE_CHECKING:
     import xarray as xr
 
+RESULT = "result.nc"
+"""The result file in the directory of a run."""
 LARGE = 2**28
 """Bytes of a file beyond which arrays are read only when they are asked for."""
 SLIGHT = 1e-3
@@ -80,13 +82,17 @@ class Result:
     def load(cls, path: str | os.PathLike[str]) -> Result:
         """Read what `save` wrote.
 
+        Args:
+            path: of the file, or of the directory of a run, which holds it.
+
         Raises:
             InvalidResult: no such file, or not a result of consat.
         """
-        if not Path(path).is_file():
-            raise InvalidResult(f"{path}: there is no such file; `consat run SCENARIO --out DIR` writes DIR/result.nc")
+        path = Path(path) / RESULT if Path(path).is_dir() else Path(path)
+        if not path.is_file():
+            raise InvalidResult(f"{path}: there is no such file; `consat run SCENARIO --out DIR` writes DIR/{RESULT}")
         try:
-            data = _read(Path(path))
+            data = _read(path)
             schema, summary, scenario = data.attrs["schema"], json.loads(data.attrs["summary"]), data.attrs["scenario"]
         except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise InvalidResult(f"{path}: this is not a result of consat ({error}); give a file that `consat run --out` wrote") from error

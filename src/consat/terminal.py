@@ -26,6 +26,7 @@ estimates_option = click.option(
 out_option = click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there."
 )
+force_option = click.option("--force", is_flag=True, help="Overwrite results of another scenario in --out.")
 full_option = click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
 

@@ -54,9 +54,8 @@ def test_a_path_through_a_pillar_is_said(crossing: cs.Result) -> None:
 
 
 def test_nothing_is_lost_where_little_is_recorded(crossing: cs.Result, tmp_path: Path) -> None:
-    thin = cs.run(corridor(), rate=10, speed=0.5, every=50, agents=["buddy"])
-    filed = cs.run(corridor(), rate=10, speed=0.5, agents="none", out=tmp_path / "filed")
-    assert told(thin) == told(filed) == told(crossing)
+    thin = cs.run(corridor(), rate=10, speed=0.5, every=50, agents=["buddy"], out=tmp_path / "filed")
+    assert told(thin) == told(crossing)
     assert told(cs.Result.load(tmp_path / "filed" / "result.nc")) == told(crossing)
 
 
@@ -79,10 +78,10 @@ def test_a_flow_counts_too() -> None:
 def test_own_constraints_that_are_not_concave_are_watched_and_a_convex_team_says_nothing() -> None:
     own = cs.expr("norm2(a - b) - 1", name="clear")
     team = cs.Team([cs.Agent("a", [cs.within([0, 0], 3), own], start=[0, 0]), cs.Agent("b", [cs.within([0, 0], 3)], start=[0.1, 0])])
-    shares = told(cs.run(team))
+    shares = told(cs.run(team, rounds=10))
     assert shares[("a", "clear")] > 0  # type: ignore[operator]
     assert [shares[key] for key in (("a", "within"), ("b", "within"))] == [None, None]
-    convex = cs.run("case-b")
+    convex = cs.run("case-b", rounds=3)
     assert set(told(convex).values()) == {None}
     assert convex.summary["on_the_way"] == {"watched": 0, "violated": 0, "worst": None}
     assert "on the way" not in str(convex)

@@ -10,7 +10,18 @@ import click
 
 from consat.errors import counted
 from consat.network.environment import prepare_own
-from consat.terminal import DONE, estimates_option, full_option, json_option, located, out_option, scenario_argument, set_option, tell
+from consat.terminal import (
+    DONE,
+    estimates_option,
+    force_option,
+    full_option,
+    json_option,
+    located,
+    out_option,
+    scenario_argument,
+    set_option,
+    tell,
+)
 
 if TYPE_CHECKING:
     from consat.network.part import Part
@@ -88,7 +99,10 @@ def split(
     addresses: tuple[str, ...], port: int, absent: tuple[str, ...], run: str | None,
     protocol: str | None, estimates: str | None, seed: int | None,
 ) -> None:  # fmt: skip
-    """Write one private file an agent: its own constraints, its neighbours' names and addresses, and nothing of the others."""
+    """Write one private file for each agent.
+
+    It holds the agent's own constraints, its neighbours' names and addresses, and nothing of the others.
+    """
     prepare_own(exact=False)
     from consat.network.names import spelled
     from consat.network.part import split as split_scenario
@@ -140,7 +154,10 @@ def agent(
     *, scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
     rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, **around: Any,
 ) -> int:  # fmt: skip
-    """Run one agent: from its private FILE, or its own part of a scenario. Events are JSON lines on stdout."""
+    """Run one agent, as on its own robot.
+
+    FILE is its private file (consat split), or a scenario, of which it takes its own part. Events are JSON lines on stdout.
+    """
     prepare_own(exact=mode == "lockstep")
     from consat.network.modes import Manner
     from consat.network.process import Circumstances, run_agent
@@ -174,25 +191,33 @@ def agent(
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; after convergence if nothing is said.")
 @keys_option
 @out_option
+@force_option
 @full_option
 @click.option("--quiet", is_flag=True, help="No table and no summary.")
 @json_option
 def launch(
     *, scenario: str, overrides: tuple[str, ...], protocol: str | None, estimates: str | None, seed: int | None, keys: Path | None,
-    out: Path | None, full: bool, quiet: bool, as_json: bool, **plan: Any,
+    out: Path | None, force: bool, full: bool, quiet: bool, as_json: bool, **plan: Any,
 ) -> int:  # fmt: skip
-    """Start every agent of a team as a process on this machine, watch them, and gather a result."""
+    """Run every agent of a team as a process on this machine.
+
+    They are watched until they have converged, and started again if they crash; then a result is gathered.
+    """
     prepare_own(exact=False)
     from consat.network.launch import Plan
     from consat.network.launch import launch as launch_team
+    from consat.result import RESULT
     from consat.scenario import load
+    from consat.simulate.files import claim
 
     loaded = _with(load(scenario, overrides), protocol, estimates, seed)
+    if out is not None:
+        claim(out, loaded.name, force=force)
     with located(loaded):
         result = launch_team(loaded, Plan(**plan, keys=_keys(keys, scenario, loaded.team.ids)), quiet=quiet or as_json, full=full)
     if out is not None:
-        result.summary["result"] = str(out / "result.nc")
-        result.save(out / "result.nc")
+        result.summary["result"] = str(out / RESULT)
+        result.save(out / RESULT)
         result.plot(out)
     return tell(result, quiet=quiet, as_json=as_json)
 

@@ -20,7 +20,10 @@ from consat.errors import counted
 @click.option("--replace", is_flag=True, help="Renew the keys of agents that have some; the authority stays.")
 @click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. count=5.")
 def keys(agents: tuple[str, ...], out: Path, addresses: tuple[str, ...], days: int, replace: bool, overrides: tuple[str, ...]) -> None:
-    """Make a certificate authority and a certificate for each agent: of a scenario, or of the IDs given."""
+    """Make keys and certificates for the agents of a team.
+
+    That is a certificate authority, and a certificate for each agent: of a scenario, or of the IDs given.
+    """
     from consat.network.keys import CA_KEY, make
 
     ids = _ids(agents, overrides)

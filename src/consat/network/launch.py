@@ -17,7 +17,7 @@ from consat.network.alone import Alone
 from consat.network.board import board
 from consat.network.fleet import Fleet, free_ports
 from consat.network.gather import Observer
-from consat.network.modes import RATE, Mode
+from consat.network.modes import RATE, Manner, Mode, protocol_of
 from consat.network.part import Part, split
 from consat.numerics import float64
 from consat.objective import Schedule
@@ -70,6 +70,9 @@ class Plan:
     stop: Stop | None = None
     keys: Path | None = None
 
+    def __post_init__(self) -> None:
+        Manner(self.mode, self.rate, self.pace)  # what no agent could run is refused here, once
+
     @property
     def ending(self) -> Stop:
         """When to end."""
@@ -97,6 +100,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
 
     Raises:
         InvalidTeam: a cluster is not connected by links, or a constraint is a Python function, which no other process can be given.
+        InvalidSettings: the mode does not run the scenario's protocol.
         NetworkError: an agent's process failed.
     """
     team = scenario.team
@@ -126,8 +130,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
 
 def _settings(asked: Settings, mode: Mode) -> Settings:
     """The protocol that runs is the mode's own, unless the scenario asks for one."""
-    kind = "gradient-flow" if mode == "link" else asked.protocol.kind or "admm"
-    return asked.model_copy(update={"protocol": asked.protocol.model_copy(update={"kind": kind})})
+    return asked.model_copy(update={"protocol": asked.protocol.model_copy(update={"kind": protocol_of(mode, asked.protocol.kind)})})
 
 
 @dataclass(frozen=True)

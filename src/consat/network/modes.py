@@ -22,6 +22,8 @@ from consat.protocols import ROUNDS, with_gains
 
 Mode = Literal["lockstep", "link", "admm"]
 DEFAULT_MODE: Final = "admm"
+LINK: Final = "gradient-flow"
+"""The protocol of mode link."""
 RATE: Final = {"admm": 100.0, "link": 50.0}
 """Turns a second where nobody says, Hz."""
 
@@ -84,17 +86,33 @@ class Runner(Protocol):
         ...
 
 
-def core_of(part: Part, manner: Manner) -> Embodied:
-    """What the agent computes."""
-    asked = part.settings.protocol
-    if manner.mode == "link":
-        gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
-        return Embodied(LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace))
-    kind = asked.kind or DEFAULT_MODE
-    if manner.mode == "admm" and kind != "admm":
+def protocol_of(mode: Mode, asked: str | None) -> str:
+    """The kind of protocol that runs in a mode, where a scenario asks for one, or for none.
+
+    Raises:
+        InvalidSettings: the mode does not run the protocol that is asked for.
+    """
+    if mode == "link":
+        if asked not in (None, LINK):
+            raise InvalidSettings(
+                f"mode link runs the protocol {LINK}, but the protocol is {asked}; mode lockstep runs protocols in rounds"
+            )
+        return LINK
+    kind = asked or DEFAULT_MODE
+    if mode == "admm" and kind != "admm":
         raise InvalidSettings(f"mode admm runs the protocol admm, but the protocol is {kind}; mode lockstep runs every protocol in rounds")
     if kind not in ROUNDS:
         raise InvalidSettings(f"mode lockstep runs protocols in rounds, {', '.join(ROUNDS)}, but the protocol is {kind}")
+    return kind
+
+
+def core_of(part: Part, manner: Manner) -> Embodied:
+    """What the agent computes."""
+    asked = part.settings.protocol
+    kind = protocol_of(manner.mode, asked.kind)
+    if manner.mode == "link":
+        gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
+        return Embodied(LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace))
     return Embodied(RoundCore(with_gains(ROUNDS[kind](), asked), part))
 
 

@@ -16,14 +16,14 @@ from consat.errors import InvalidSettings
 from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.protocols import FLOWS, ROUNDS, with_gains
-from consat.result import Result
+from consat.result import RESULT, Result
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
 from consat.simulate import Stop
 from consat.simulate import checkpoint as checkpoints
-from consat.simulate.files import RESULT, Files
+from consat.simulate.files import Files, claim
 from consat.simulate.flows import simulate_flow
 from consat.simulate.kernel import Body, Weather
 from consat.simulate.recording import Choice, Who
@@ -53,6 +53,7 @@ def run(
     every: int = 1,
     out: str | os.PathLike[str] | None = None,
     checkpoint: float | None = None,
+    force: bool = False,
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Result:
@@ -78,6 +79,7 @@ def run(
         every: each how manieth round, or sample of a flow, to record.
         out: a directory, for a result file ``result.nc`` that grows as the run goes on; by default the record is held in memory.
         checkpoint: seconds between two checkpoints in `out`, from which `resume` goes on; none if None.
+        force: whether to overwrite results of another scenario in `out`.
         full: whether to list every agent in the summary, however many.
         progress: called with the fraction done and the margin.
 
@@ -87,7 +89,7 @@ def run(
     Raises:
         InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
         InvalidScenario: the scenario has faults.
-        InvalidSettings: the settings do not fit together.
+        InvalidSettings: the settings do not fit together, or `out` cannot be written to or holds results of another scenario.
     """
     given = {
         "protocol": protocol, "estimates": estimates, "seed": seed, "start": start, "smoothing": smoothing,
@@ -96,8 +98,11 @@ def run(
     }  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
+    scenario = scenario_of(team)
+    if out is not None:
+        claim(Path(out), scenario.name, force=force)
     files = None if out is None else Files(Path(out), checkpoint)
-    return _start(scenario_of(team), given, files, full, progress)
+    return _start(scenario, given, files, full, progress)
 
 
 def resume(
@@ -139,7 +144,12 @@ def _start(
     scenario: Scenario, given: Mapping[str, Any], files: Files | None, full: bool, progress: Callable[[float, float], None]
 ) -> Result:
     """Check the settings, and run; `given` are the arguments of `run`."""
-    about = {"scenario": scenario.text, "name": scenario.source, "given": {key: _as_data(value) for key, value in given.items()}}
+    about = {
+        "scenario": scenario.text,
+        "scenario_name": scenario.name,
+        "name": scenario.source,
+        "given": {key: _as_data(value) for key, value in given.items()},
+    }
     if given["auxiliary"] is not None:
         scenario = with_auxiliary(scenario, given["auxiliary"])
     settings = settings_of(scenario.settings, given)

@@ -17,7 +17,7 @@ import numpy as np
 
 from consat import __version__
 from consat.central.certificate import bounds
-from consat.errors import InvalidSettings
+from consat.errors import InvalidSettings, shown
 from consat.estimates import Layout
 from consat.numerics import float64
 from consat.protocols import FLOWS, ROUNDS, with_gains
@@ -35,6 +35,8 @@ from consat.teams.team import Team
 SCHEMA = "consat.sweep/1"
 MOST_LISTED = 10_000
 """Above this many runs the summary leaves them out; the CSV file lists all."""
+MOST_VALUES = 1_000_000
+"""In a range; each value is a run."""
 OF_A_RUN = ("loss", "sleep")
 """Parameters that belong to a run rather than to the scenario."""
 MEASURED = ("satisfied_from", "margin", "smooth_margin", "rounds", "messages", "floats_sent")
@@ -87,9 +89,12 @@ def values(text: str) -> list[Any]:
     if text.count(":") == 2 and "[" not in text and "{" not in text:
         low, high, count = text.split(":")
         try:
-            found = np.linspace(float(low), float(high), int(count))
+            ends, number = (float(low), float(high)), int(count)
         except ValueError:
             raise InvalidSettings(f"{text!r} is no range; write FROM:TO:COUNT, such as 0.5:2:16") from None
+        if not np.isfinite(ends).all() or not 0 < number <= MOST_VALUES:
+            raise InvalidSettings(f"{text!r} is no range; FROM and TO must be finite, and COUNT a whole number from 1 to {MOST_VALUES:,}")
+        found = np.linspace(*ends, number)
         return [float(f"{value:.12g}") for value in found]
     parts, depth = [""], 0
     for char in text:
@@ -208,10 +213,8 @@ class _Asked:
             overrides = [f"{path}={json.dumps(chosen[path])}" for path in of_scenario]
             if (key := json.dumps(overrides)) not in made:
                 made[key] = self._prepared(overrides)
-            weather = tuple(float(chosen.get(name, getattr(self, name))) for name in OF_A_RUN)
-            if not all(0 <= value < 1 for value in weather):
-                raise InvalidSettings(f"loss is {weather[0]} and sleep is {weather[1]}, but both must be probabilities below 1")
-            yield _Combination(chosen, made[key], weather)  # type: ignore[arg-type]
+            loss, sleep = (_probability(name, chosen.get(name, getattr(self, name))) for name in OF_A_RUN)
+            yield _Combination(chosen, made[key], (loss, sleep))
 
     def _prepared(self, overrides: Sequence[str]) -> Prepared:
         scenario = loads(self.scenario.text, self.scenario.source, overrides) if overrides else self.scenario
@@ -298,6 +301,13 @@ class _Asked:
             progress((k + 1) / total, satisfied / (k + 1))
             measured = {name: since if name == "satisfied_from" else told[name] for name in MEASURED}
             yield {**combination.chosen, "seed": seed, **{key: told[key] for key in ("status", "verdict", "ending")}, **measured}
+
+
+def _probability(name: str, value: Any) -> float:
+    """Raises: InvalidSettings: it is none, or 1."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
+        raise InvalidSettings(f"{name} is {shown(value)}, but must be a probability below 1, such as 0.3")
+    return float(value)
 
 
 def _row(ready: Prepared, outcome: Outcome) -> dict[str, Any]:

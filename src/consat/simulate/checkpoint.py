@@ -112,6 +112,13 @@ def read(path: Path) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
     return arrays, meta
 
 
+def scenario(path: Path) -> str | None:
+    """The name of the scenario whose checkpoint it is, None if it does not say; errors as of `read`, or of what is no checkpoint."""
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        name: str | None = json.loads(file[_META].tobytes()).get("scenario_name")
+    return name
+
+
 def fingerprint(team: Team, *parts: Any) -> str:
     """A hash of the team's numbers and of everything else that decides what a run does.
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,19 +12,64 @@ from typing import Any
 
 import numpy as np
 
-from consat.errors import InvalidResult
+from consat.errors import InvalidResult, InvalidSettings
 from consat.estimates import Estimates
-from consat.netcdf import VARIABLES, write
-from consat.result import attributes, labels, variables
+from consat.netcdf import VARIABLES, attribute, write
+from consat.result import RESULT, attributes, labels, variables
 from consat.simulate import checkpoint
 from consat.simulate.checkpoint import Checkpoint
 from consat.simulate.recording import Choice, Log
 from consat.teams.team import Team
 from consat.trace import Trace
 
-RESULT, LOG = "result.nc", "record.bin"
+LOG = "record.bin"
 SECONDS = 10.0
 """Between two checkpoints when nobody says."""
+
+
+SWEEP = "sweep.json"
+"""What `consat.sweep` writes, beside its figure and table."""
+
+
+def claim(directory: Path, scenario: str, *, force: bool) -> None:
+    """See, before anything is computed, that results can be written to a directory, and that those of another scenario are not overwritten.
+
+    Args:
+        directory: made if need be.
+        scenario: the name of the one whose results are to be written.
+        force: whether to overwrite whatever is there.
+
+    Raises:
+        InvalidSettings: it cannot be written to, or holds results of another scenario, or a file of that name that is none.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise InvalidSettings(f"results cannot be written to {directory} ({error.strerror or error}); choose another folder") from error
+    if force:
+        return
+    for name, whose in ((RESULT, _of_result), (SWEEP, _of_sweep), (checkpoint.NAME, checkpoint.scenario)):
+        if not (directory / name).is_file():
+            continue
+        try:
+            other = whose(directory / name)
+        except (OSError, ValueError, KeyError, TypeError, InvalidResult):
+            raise InvalidSettings(f"{directory / name} is not of consat, and would be overwritten; {CHOOSE}") from None
+        if other not in (None, scenario):
+            raise InvalidSettings(f"{directory} holds results of another scenario, {other!r}; {CHOOSE}")
+
+
+CHOOSE = "choose another folder, or overwrite it with --force (force=True in Python)"
+
+
+def _of_result(path: Path) -> str:
+    return str(json.loads(attribute(path, "summary"))["scenario"])
+
+
+def _of_sweep(path: Path) -> str:
+    return str(json.loads(path.read_text(encoding="utf-8"))["scenario"])
 
 
 @dataclass(frozen=True)
