@@ -206,7 +206,10 @@ class _Reader:
     def value(self, event: Event, path: Path) -> Node:
         place = self.place(event.start_mark)
         if isinstance(event, NodeEvent) and event.anchor is not None:
-            self.fault(path, "anchors (&) and aliases (*) are not part of a scenario; write the value itself, in quotes if it is text")
+            self.fault(
+                path,
+                "anchors (&) and aliases (*) are not part of a scenario; write the value itself, text in quotes; agents alike are a group",
+            )
         elif isinstance(event, ScalarEvent | CollectionStartEvent) and event.tag is not None:
             self.fault(path, "tags (!) are not part of a scenario; remove it, or put text that starts with ! in quotes")
         if isinstance(event, ScalarEvent):
