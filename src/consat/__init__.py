@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
+    from consat.objective import margins
     from consat.result import Result
     from consat.runs.runner import resume, run
     from consat.runs.solving import solve
@@ -28,6 +29,7 @@ _HOME = {
     "errors": (
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
+    "objective": ("margins",),
     "result": ("Result",),
     "runs.runner": ("resume", "run"),
     "runs.solving": ("solve",),
@@ -43,8 +45,8 @@ _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
     "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Sweep", "Team", "apart", "box",
-    "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "near", "outside", "resume", "run", "solve",
-    "sweep", "within",
+    "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "margins", "near", "outside", "resume", "run",
+    "solve", "sweep", "within",
 ]  # fmt: skip
 
 

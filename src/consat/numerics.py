@@ -160,15 +160,31 @@ class Groups:
         return functools.reduce(fold.two, list(parts)) if self.width <= UNROLLED else fold.axis(parts, axis=0)
 
     def logsumexp(self, elements: Array) -> tuple[Array, Array]:
-        """(E,) → (G,) and (E,): log Σ exp over each group, −∞ for an empty one, and the softmax weights within the group."""
+        """(E,) → (G,) and (E,): log Σ exp over each group, −∞ for an empty one, and the softmax weights within the group. Where elements
+        are +∞, so is the sum, and they share the weight."""
         if self.width <= 1 and self.padded:
             return self.max(elements), jnp.ones_like(elements)
         top = jax.lax.stop_gradient(self.max(elements))
         shift = jnp.where(jnp.isfinite(top), top, 0.0)
-        powers = jnp.exp(elements - self.spread(shift))
+        powers = _powers(elements, self.spread(shift), self.spread(top))
         total = self.sum(powers)
         weights = powers / self.spread(jnp.where(total > 0.0, total, 1.0))
-        return jnp.where(total > 0.0, jnp.log(jnp.where(total > 0.0, total, 1.0)) + shift, -jnp.inf), weights
+        log = jnp.where(total > 0.0, jnp.log(jnp.where(total > 0.0, total, 1.0)) + shift, -jnp.inf)
+        return jnp.where(top == jnp.inf, jnp.inf, log), weights
+
+
+def softmax(elements: Array) -> Array:
+    """(E,) weights that sum to 1, as `jax.nn.softmax`; elements that are +∞ share them."""
+    top = jnp.max(elements, initial=-jnp.inf)
+    powers = _powers(elements, jnp.where(jnp.isfinite(top), top, 0.0), top)
+    total = jnp.sum(powers)
+    return powers / jnp.where(total > 0.0, total, 1.0)
+
+
+def _powers(elements: Array, shift: Array, top: Array) -> Array:
+    """e^(elements − shift); where the largest, `top`, is +∞, 1 for those that are it and 0 for the others."""
+    unlimited = top == jnp.inf
+    return jnp.where(unlimited, (elements == jnp.inf).astype(elements.dtype), jnp.exp(jnp.where(unlimited, 0.0, elements - shift)))
 
 
 class _Fold(NamedTuple):

@@ -19,8 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from consat.numerics import Groups, pick
+from consat.constraints.domain import HUGE, Extended, extended
+from consat.errors import InvalidSettings, shown
+from consat.numerics import Groups, float64, pick, softmax
 from consat.settings import Ramp, Smoothing
 from consat.teams.family import Family
 from consat.teams.team import Team
@@ -81,7 +84,7 @@ class Batch:
         rows: (M_f, arity) int32.
         parameters: arrays with leading axis M_f.
         weight: (M_f,).
-        psi: the shared function.
+        psi: the shared function, −∞ where it is no finite number; see `consat.constraints.domain`.
     """
 
     rows: Array
@@ -89,12 +92,17 @@ class Batch:
     weight: Array
     psi: Callable[..., Any] = field(metadata={"static": True})
 
+    @property
+    def partial(self) -> bool:
+        """Whether ψ may be −∞ somewhere."""
+        return isinstance(self.psi, Extended)
+
     def values(self, x: Array) -> Array:
-        """(M_f,) weighted ψ at a state (rows, d)."""
+        """(M_f,) weighted ψ at a state (rows, d); −∞ where ψ is no finite number."""
         return self.weight * self._of_all(lambda at, p: self.psi(*at, **p), x)
 
     def gradients(self, x: Array) -> tuple[Array, Array]:
-        """(M_f,) values and (arity, d, M_f) gradients with respect to the arguments."""
+        """(M_f,) values and (arity, d, M_f) gradients with respect to the arguments, which are 0 where ψ has none."""
         values, gradients = self._of_all(jax.value_and_grad(lambda at, p: self.psi(*at, **p)), x)
         return self.weight * values, self.weight[None, None] * gradients
 
@@ -141,7 +149,7 @@ class Objective:
                     jnp.asarray(place, dtype=jnp.int32),
                     {key: jnp.asarray(value) for key, value in family.parameters.items()},
                     jnp.asarray(family.weight),
-                    family.psi,
+                    extended(family.psi, family.arity, team.dimension, family.parameters),
                 )
                 for family, place in placed
             ),
@@ -181,7 +189,7 @@ class Objective:
     def multipliers(self, x: Array, nu: Nu) -> Array:
         """(M,) λ_ik = softmax over all agents and constraints, λ ∝ e^{−ν_β α_i} p_ik: how much each constraint binds."""
         log_h, weights = self.owners.logsumexp(-nu.alpha * self._values(x))
-        return self._in_order(self.owners.spread(jax.nn.softmax(nu.beta / nu.alpha * log_h)) * weights)
+        return self._in_order(self.owners.spread(softmax(nu.beta / nu.alpha * log_h)) * weights)
 
     def ascent(self, x: Array, nu: Nu) -> Array:
         """(rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the way each agent would go for its own constraints alone."""
@@ -196,9 +204,14 @@ class Objective:
         return self._added_up(x, nu, force)
 
     def _added_up(self, x: Array, nu: Nu, weigh: Callable[[Array, Array], Array]) -> Array:
-        """(rows, d) the sum of all ∇ψ_ik, weighed by a function of ln Σ_k e^{−ν_α ψ_ik}, (N,), and p_ik, (M,)."""
+        """(rows, d) the sum of all ∇ψ_ik, weighed by a function of ln Σ_k e^{−ν_α ψ_ik}, (N,), and p_ik, (M,). A ψ that is −∞ has no
+        gradient to use: the others of its agent go on without it."""
         values, gradients = zip(*(batch.gradients(x) for batch in self.batches), strict=True) if self.batches else ((), ())
-        weights = weigh(*self.owners.logsumexp(-nu.alpha * jnp.concatenate([jnp.zeros(0), *values])))
+        usable = [
+            value if not batch.partial else jnp.where(value >= -HUGE, value, jnp.inf)
+            for batch, value in zip(self.batches, values, strict=True)
+        ]
+        weights = weigh(*self.owners.logsumexp(-nu.alpha * jnp.concatenate([jnp.zeros(0), *usable])))
         ends = np.cumsum([len(value) for value in values])[:-1]
         pieces = [w[None, None] * g for w, g in zip(jnp.split(weights, ends), gradients, strict=True)] if gradients else []
         flat = [jnp.moveaxis(piece, -1, 0).reshape(-1, x.shape[-1]) for piece in pieces]
@@ -223,3 +236,48 @@ def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, floa
     owners, most = max(int(np.count_nonzero(sizes)), 1), max([1, *sizes[sizes > 0].tolist()])
     slack = math.log(owners) / float(nu.beta) + math.log(most) / float(nu.alpha)
     return smooth_margin, smooth_margin + slack
+
+
+@float64
+def margins(team: Team, positions: ArrayLike | Mapping[str, ArrayLike]) -> np.ndarray:
+    """(N,) the margin ᾱ_i = min_k ψ_ik of every agent of a team at given positions: positive where all of its constraints hold.
+
+    +∞ for an agent without constraints; −∞ where one of its ψ is no finite number, as log(x) is none at x = −1.
+
+    Args:
+        team: the team.
+        positions: (N, d), in the order of ``team.ids``, or one position for each id; length.
+
+    Raises:
+        InvalidSettings: the positions are not those of this team.
+    """
+    x = _formation(team, positions)
+    return np.array(_agent_margins(Objective.at_positions(team), jnp.asarray(x)))
+
+
+@jax.jit
+def _agent_margins(observer: Objective, x: Array) -> Array:
+    return observer.agent_margins(x)
+
+
+def _formation(team: Team, positions: ArrayLike | Mapping[str, ArrayLike]) -> np.ndarray:
+    if not isinstance(team, Team):
+        raise InvalidSettings(f"margins takes a team, but got {shown(team)}; of a scenario file, consat.load(FILE).team is one")
+    if isinstance(positions, Mapping):
+        known = set(team.ids)
+        missing, unknown = [agent for agent in team.ids if agent not in positions], [agent for agent in positions if agent not in known]
+        if missing or unknown:
+            what = f"none of {missing[0]!r}" if missing else f"one of {unknown[0]!r}, who is not in the team"
+            raise InvalidSettings(f"positions must hold one position for each of the {team.count} agents, but there is {what}")
+        positions = [positions[agent] for agent in team.ids]  # type: ignore[assignment]
+    wanted = f"numbers of shape ({team.count}, {team.dimension}): one row an agent, in the order of team.ids"
+    try:
+        x = np.asarray(positions, dtype=float)
+    except (TypeError, ValueError):
+        raise InvalidSettings(f"positions are {shown(positions)}, but must be {wanted}") from None
+    if x.shape != (team.count, team.dimension):
+        raise InvalidSettings(f"positions have shape {x.shape}, but must be {wanted}")
+    if not np.isfinite(x).all():
+        k = int(np.argmin(np.isfinite(x).all(axis=1)))
+        raise InvalidSettings(f"the position of {team.ids[k]!r} is {x[k].tolist()}, but must be finite")
+    return x

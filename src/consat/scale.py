@@ -103,8 +103,10 @@ def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
     return size.center - size.reach, size.center + size.reach
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _second_order(psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _second_order(
+    psi: Callable[..., Any], arity: int, dimension: int, members: int, parameters: dict[str, jax.Array]
+) -> tuple[jax.Array, ...]:
     def flat(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
         return psi(*x.reshape(arity, dimension), **parameters)
 
@@ -112,7 +114,7 @@ def _second_order(psi: Callable[..., Any], arity: int, dimension: int, parameter
         origin = jnp.zeros(arity * dimension)
         return (*jax.value_and_grad(flat)(origin, parameters), jax.hessian(flat)(origin, parameters))
 
-    return jax.vmap(both)(parameters)
+    return jax.vmap(both, axis_size=members)(parameters)
 
 
 def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -121,7 +123,9 @@ def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np
     try:
         value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
     except ValueError:  # beyond degree 2: to second order about the origin
-        value, b, hessian = (np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters)))
+        value, b, hessian = (
+            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, family.size, dict(family.parameters))
+        )
     hessian = once(hessian)
     finite = np.isfinite(hessian).all(axis=(1, 2))
     usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & finite

@@ -115,7 +115,7 @@ def with_tangents(team: Team, model: Expansion, lower: Floats, curved: NDArray[n
             usable = np.isfinite(value) & np.isfinite(gradient).all(axis=(1, 2))
             number = size + np.arange(usable.sum())
             flat = np.zeros((len(number), columns.shape[1], columns.shape[1]))
-            blocks.append(Block(number, columns[usable], gradient[usable].reshape(len(number), -1), flat))
+            blocks.append(Block(number, columns[usable], gradient[usable].reshape(len(number), columns.shape[1]), flat))
             values.append((value - gradient[:, 0] @ shift)[usable])
             lowers.append(lower[family.number[members]][usable])
             size += len(number)

@@ -88,6 +88,7 @@ class Alone(LocalSolver):
             nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
             local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
             holder=jnp.zeros(team.count, dtype=np.int32),
+            own=jnp.array([me], dtype=np.int32),
             talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
             hops=part.hops,
             convex=part.convex,

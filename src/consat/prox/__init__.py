@@ -76,7 +76,7 @@ def step(
 
     found = []
     for batch in plan.batches:
-        if precision.tolerance is None and len(batch.rows) > 1:
+        if precision.tolerance is None and len(batch.rows) > 1 and not batch.partial:  # it knows no walls
             first = _by_chunk(batch, functools.partial(answers, solve_most))
             found.append(_finish(batch, first, functools.partial(answers, solve)))
         else:

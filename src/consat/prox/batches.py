@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from consat.constraints.curvature import hessians
+from consat.constraints.domain import Extended, extended
 from consat.numerics import once
 from consat.teams.family import Family, distinct
 from consat.teams.team import Team
@@ -79,6 +80,7 @@ class Batch:
         forms: what is known of these beforehand.
         known: whether all of it is.
         convex: whether every ψ is known to be concave.
+        partial: whether some ψ may be −∞ somewhere; see `consat.constraints.domain`.
     """
 
     agents: Array
@@ -87,6 +89,7 @@ class Batch:
     forms: tuple[Form, ...] = field(metadata={"static": True})
     known: bool = field(metadata={"static": True})
     convex: bool = field(metadata={"static": True})
+    partial: bool = field(metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
@@ -271,7 +274,8 @@ class _Made:
 
     def batch(self, convex: bool) -> Batch:
         known = all(form.slots is not None and form.bend is not None for form in self.forms)
-        return Batch(jnp.asarray(self.agents), jnp.asarray(self.rows), self.kinds, self.forms, known, convex)
+        partial = any(isinstance(form.psi, Extended) for form in self.forms)
+        return Batch(jnp.asarray(self.agents), jnp.asarray(self.rows), self.kinds, self.forms, known, convex, partial)
 
 
 def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callable[..., np.ndarray], count: int) -> _Made:
@@ -309,5 +313,6 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
                 None if used.all() else jnp.asarray(cut(used.T)),
             )
         )
-        forms.append(Form(family.psi, tuple(map(tuple, slots.tolist())) if slots.ndim == 2 else None, bend))
+        psi = extended(family.psi, family.arity, team.dimension, family.parameters)
+        forms.append(Form(psi, tuple(map(tuple, slots.tolist())) if slots.ndim == 2 else None, bend))
     return _Made(cut(group.agents.astype(np.int32)), cut(rows), tuple(kinds), tuple(forms))

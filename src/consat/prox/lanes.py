@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.constraints.domain import HUGE
 from consat.numerics import add_up
 from consat.objective import Nu
 from consat.prox.batches import Batch, Form, Kind, Matrix
@@ -69,6 +70,8 @@ class Lanes:
 
     def _soft(self, violations: Array, sharpness: Array) -> tuple[Array, Array]:
         """(A,) L and (m, A) the weights p."""
+        if self.batch.partial:
+            return self._soft_within(violations, sharpness)
         if len(violations) == 1:  # nothing to be soft about
             return self.nu.beta * violations[0] + self.offset, jnp.ones_like(violations)
         count = jnp.log(self.count(violations))
@@ -78,6 +81,30 @@ class Lanes:
         total = add_up(powers)
         blunt = top + jnp.log(total) - count
         return self.nu.beta / self.nu.alpha * (blunt / sharpness + count) + self.offset, powers / total[None]
+
+    def _soft_within(self, violations: Array, sharpness: Array) -> tuple[Array, Array]:
+        """The same where some ψ are −∞: L is +∞ there, and its derivatives are those of the other ψ alone. Nothing that is not finite is
+        computed with on the way, so that no derivative is NaN; and ψ may be so steep that the sharpness is next to nothing."""
+        inside, number = (violations > -jnp.inf) & (violations <= HUGE), self.count(violations)
+        some = jnp.where(inside, violations, 0.0)
+        top = jnp.max(jnp.where(inside, violations, -jnp.inf), axis=0)
+        top = jnp.where(jnp.isfinite(top), top, 0.0)
+        below = (sharpness * self.nu.alpha)[None] * jnp.where(inside, some - top[None], 0.0)
+        powers = jnp.where(inside, jnp.exp(below), 0.0)
+        total = add_up(powers)
+        blunt = jnp.log1p(add_up(jnp.where(inside, jnp.expm1(below), 0.0)) / number) / sharpness
+        level = self.nu.beta * top + self.nu.beta / self.nu.alpha * (blunt + jnp.log(number)) + self.offset
+        return jnp.where(self.outside(violations), jnp.inf, level), powers / jnp.where(total > 0.0, total, 1.0)[None]
+
+    def outside(self, violations: Array) -> Array:
+        """(A,) whether some ψ is −∞, or as good as that."""
+        return jnp.any(violations > HUGE, axis=0)
+
+    def bluntest(self, violations: Array) -> Array:
+        """(A,) the sharpness at which a soft minimum sees no kink between the constraints."""
+        used = violations > -jnp.inf
+        spread = jnp.max(violations, axis=0) - add_up(jnp.where(used, violations, 0.0)) / self.count(violations)
+        return 1.0 / jnp.maximum(self.nu.alpha * spread, 1.0)
 
     def expand(self, y: Array, sharpness: Array) -> Expanded:
         """L to second order at y, (n, d, A)."""

@@ -28,6 +28,8 @@ UNSEARCHED = 2
 """Steps of a chunk that go without a line search."""
 SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
 """Parts of a step that a line search tries."""
+SHORTEST = 12
+"""How often a step that would leave the domain of a ψ is divided by four before it is given up."""
 
 
 class Guess(NamedTuple):
@@ -163,8 +165,30 @@ class _Task(NamedTuple):
     def start(self, guess: Guess) -> _Search:
         count = self.v.shape[1]
         infinity = jnp.full(count, jnp.inf, self.v.dtype)
-        nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int), jnp.zeros(count, bool)
-        return _Search(guess.y.reshape(self.v.shape), guess.sigma, guess.sharpness, -infinity, infinity, *nothing)
+        y, done = guess.y.reshape(self.v.shape), jnp.zeros(count, bool)
+        if self.lanes.batch.partial:  # who is outside follows v, and begins there if that is inside
+            y = jnp.where(self.inside(y)[None], y, self.v)
+            done = ~self.inside(y)
+        nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int)
+        return _Search(y, guess.sigma, guess.sharpness, -infinity, infinity, *nothing, done)
+
+    def inside(self, y: Array) -> Array:
+        """(A,) whether every ψ is a number at y, (N, A), that can be computed with."""
+        return ~self.lanes.outside(self.lanes.violations(y.reshape(*self.shape, -1)))
+
+    def shortened(self, y: Array, to: Array) -> Array:
+        """(N, A) `to`, or where it lies outside what is nearer to y; y at last. Where a ψ ends, a step ends."""
+        if not self.lanes.batch.partial:
+            return to
+
+        def shorten(at: tuple[Array, Array]) -> tuple[Array, Array]:
+            number, step = at
+            return number + 1, jnp.where(self.inside(y + step)[None], step, jnp.where(number < SHORTEST, 0.25 * step, 0.0))
+
+        def goes_on(at: tuple[Array, Array]) -> Array:
+            return (at[0] <= SHORTEST) & ~jnp.all(self.inside(y + at[1]))
+
+        return y + jax.lax.while_loop(goes_on, shorten, (jnp.asarray(0), to - y))[1]
 
     def found(self, at: _Search) -> Found:
         return Found(Guess(at.y.reshape(*self.shape, -1), at.sigma, at.sharpness), at.stiffness, at.iterations, at.done)
@@ -191,6 +215,7 @@ class _Task(NamedTuple):
         bracketed = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
         wanted = jnp.minimum(jnp.where(bracketed, 0.5 * (low + high), wanted), ceiling)
         together = at.y + ahead.to(wanted - sigma)
+        to = self.shortened(at.y, jnp.where(near[None], together, alone))
 
         sharp = at.sharpness >= 1.0
         met = (sigma >= ceiling - 1e-6) & (gap > 0)
@@ -203,15 +228,22 @@ class _Task(NamedTuple):
         moves, rises = ~done, near & ~done
         tired = at.iterations + 1 >= MOST_ITERATIONS
         return _Search(
-            y=jnp.where(moves[None], jnp.where(near[None], together, alone), at.y),
+            y=jnp.where(moves[None], to, at.y),
             sigma=jnp.where(rises, wanted, jnp.where(at.done, at.sigma, sigma)),
-            sharpness=jnp.where(sharpen & moves, jnp.minimum(SHARPEN * at.sharpness, 1.0), at.sharpness),
+            sharpness=jnp.where(sharpen & moves, self.sharper(at, to), at.sharpness),
             low=jnp.where(sharpen, -jnp.inf, low),
             high=jnp.where(sharpen, jnp.inf, high),
             stiffness=jnp.where(at.done[None], at.stiffness, self.stiffness(here)),
             iterations=jnp.where(at.done, at.iterations, at.iterations + 1),
             done=done | last | tired,
         )
+
+    def sharper(self, at: _Search, y: Array) -> Array:
+        """(A,) the next sharpness, at y."""
+        sharper = SHARPEN * at.sharpness
+        if self.lanes.batch.partial:  # it was next to nothing where some ψ was steep, and need not be here
+            sharper = jnp.maximum(sharper, self.lanes.bluntest(self.lanes.violations(y.reshape(*self.shape, -1))))
+        return jnp.minimum(sharper, 1.0)
 
     def plain_step(self, at: _Search) -> _Search:
         """A step of Newton in every lane that is not done, and the last of those that begin it within reach of the solution; y alone moves
@@ -291,12 +323,11 @@ def cold(lanes: Lanes, v: Array, kappa: Array) -> Guess:
         kappa: (n, A).
     """
     tiny = jnp.finfo(v.dtype).tiny
-    there = lanes.violations(v)
-    used = there > -jnp.inf
-    spread = jnp.max(there, axis=0) - add_up(jnp.where(used, there, 0.0)) / lanes.count(there)
-    sharpness = 1.0 / jnp.maximum(lanes.nu.alpha * spread, 1.0)
+    sharpness = lanes.bluntest(lanes.violations(v))
     model = lanes.expand(v, sharpness)
     reach = add_up(model.slope**2 / jnp.repeat(kappa, v.shape[1], axis=0, total_repeat_length=len(model.slope)))
     height = model.level
     sigma = jnp.minimum(height, jnp.log1p(jnp.maximum(height, 0.0)) - jnp.log(jnp.maximum(reach, tiny)))
+    if lanes.batch.partial:  # outside there is nothing to begin with
+        sigma, sharpness = jnp.where(jnp.isfinite(sigma), sigma, 0.0), jnp.where(sharpness > 0.0, sharpness, 1.0)
     return Guess(v, sigma, sharpness)

@@ -374,6 +374,7 @@ def world_of(
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
         holder=jnp.asarray(copies.holder),
+        own=jnp.asarray(copies.own),
         talkers=Groups.of(talker, team.count),
         agents=team.count,
         hops=hops(team.count, copies.links),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+import types
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -37,7 +38,16 @@ class Entry:
     def family(self) -> tuple[Any, ...]:
         """What those of one family have in common."""
         shapes = tuple((key, value.shape) for key, value in sorted(self.values.items()))
-        return self.constraint.psi, len(self.agents), shapes
+        return same(self.constraint.psi), len(self.agents), shapes
+
+
+def same(psi: Callable[..., Any]) -> Hashable:
+    """What two functions have in common that compute the same: the same code over the same variables. A lambda written in a loop is
+    another object each time, yet one function; constraints that share it are one family. Valid while both functions live."""
+    if not isinstance(psi, types.FunctionType):
+        return psi
+    bound = [psi.__globals__, *(psi.__closure__ or ()), *(psi.__defaults__ or ()), *(psi.__kwdefaults__ or {}).values()]
+    return psi.__code__, tuple(map(id, bound)), psi.__name__
 
 
 @float64
