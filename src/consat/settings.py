@@ -83,7 +83,7 @@ class Start(Model):
         return box
 
 
-ProtocolKind = Literal["gradient-flow", "proportional-integral", "selfish", "proximal", "admm", "max-min"]
+ProtocolKind = Literal["interior-point", "gradient-flow", "proportional-integral", "selfish", "proximal", "admm", "max-min"]
 
 
 class ProtocolSettings(Model):

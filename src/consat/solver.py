@@ -12,6 +12,7 @@ from jax import Array
 
 from consat import prox
 from consat.constraints.domain import HUGE
+from consat.interior import Interior
 from consat.numerics import Groups, pick
 from consat.objective import Nu, Objective
 from consat.protocols.base import Links
@@ -134,6 +135,7 @@ class LocalSolver:
         region: where the team's places are.
         plan: the agents by shape, for their local steps.
         precision: of these.
+        interior: their part in `consat.protocols.interior_point`; None of other protocols.
         nu: the smoothing.
         local: every agent's objective over its copies.
         holder: (rows,) who holds each copy, in order.
@@ -146,7 +148,8 @@ class LocalSolver:
     links: Links
     length: Array
     region: Region
-    plan: prox.Plan
+    plan: prox.Plan | None
+    interior: Interior | None
     nu: Nu
     local: Objective
     holder: Array
@@ -159,11 +162,8 @@ class LocalSolver:
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
         return prox.recall(self.plan, self.nu, x, kappa)
 
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: prox.Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, prox.Memory, Array]:
-        nu = Nu(self.nu.alpha * sharper, self.nu.beta * sharper)
-        return prox.step(self.plan, nu, v, kappa, x, memory, offset=nu.beta * above - jnp.log(sharper), precision=self.precision)
+    def prox(self, v: Array, kappa: Array, x: Array, memory: prox.Memory) -> tuple[Array, prox.Memory, Array]:
+        return prox.step(self.plan, self.nu, v, kappa, x, memory, offset=0.0, precision=self.precision)
 
     def nearby(self, x: Array) -> Array:
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))

@@ -34,7 +34,8 @@ class Trace:
         satisfied_from: the first step after the last one whose margin was ≤ 0; None if the last margin is.
         messages: sent in all; None in continuous time.
         floats_sent: likewise.
-        known_from: the round from which every agent knew that all were satisfied; None in continuous time, or if they don't.
+        known: what every agent knows at the end: that all are ``satisfied``, that the team is ``infeasible``, or nothing.
+        known_from: the round since when; None in continuous time, or if they know nothing.
         seconds: spent on ``compile`` and ``run``.
         period: of a round, s; None in continuous time, and where rounds take no time.
         recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
@@ -60,6 +61,7 @@ class Trace:
     satisfied_from: float | None
     messages: int | None
     floats_sent: int | None
+    known: Literal["satisfied", "infeasible"] | None
     known_from: int | None
     seconds: Mapping[str, float]
     period: float | None = None

@@ -5,61 +5,126 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from consat.estimates import Estimates
 from consat.interior.layout import Batch, Plan, Route, Shared, plan_of, route_of
 from consat.interior import step
 from consat.interior.step import Gains, Lanes, Mail, Memory, Proof, Units
 from consat.numerics import pick, taken
+from consat.scale import Scale
+from consat.teams.team import Team
 
-__all__ = ["Batch", "Gains", "Mail", "Memory", "Plan", "Route", "Shared", "Units", "begin", "plan_of", "route_of", "round_of", "silence"]
-
-
-def silence(plan: Plan, pairs: int) -> Mail:
-    """The mail before anything was said; leading axis P."""
-    p = plan.width
-    matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
-    return Mail(matrix, vector, number - 1.0, number, number + jnp.inf, Proof(matrix, vector, number, number, number))
+__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Units", "route_of"]
 
 
-def begin(plan: Plan, units: Units, x: Array, gains: Gains) -> Memory:
-    """What all agents remember at the start, from first estimates (C, d)."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Interior:
+    """The interior-point part of some agents: all of a team, or one alone.
 
-    def start(batch: Batch) -> Memory:
-        y = jnp.moveaxis(taken(_normal(x, units), batch.rows[0], 0.0), 1, -1)
-        return _out(step.begin(_lanes(batch, units, gains), y))
+    Attributes:
+        plan: the agents by shape.
+        units: common knowledge.
+        talker: (P,) which of the agents speaks at each end of a link.
+        other: (P,) the other end of the same link; of one agent alone, whose links end elsewhere, nothing.
+        owner: (M,) whose constraint each is, family after family.
+        degree: (N,) how many neighbours each has.
+    """
 
-    return _collected(plan, [start(batch) for batch in plan.batches], units)
+    plan: Plan
+    units: Units
+    talker: Array
+    other: Array
+    owner: Array
+    degree: Array
 
+    @classmethod
+    def of(cls, team: Team, copies: Estimates, size: Scale) -> Interior:
+        """Of a whole team whose copies `route_of` has laid out."""
+        shared = Shared.of(copies)
+        talker, listener = shared.pairs.astype(np.int64).T
+        keys = talker * team.count + listener
+        owner = np.concatenate([np.zeros(0, dtype=np.int32), *(family.owner for family in team.families)])
+        return cls(
+            plan_of(team, copies, shared),
+            Units.of(size),
+            jnp.asarray(talker.astype(np.int32)),
+            jnp.asarray(np.searchsorted(keys, listener * team.count + talker).astype(np.int32)),
+            jnp.asarray(owner),
+            jnp.asarray(np.bincount(talker, minlength=team.count)),
+        )
 
-def round_of(plan: Plan, units: Units, memory: Memory, inbox: Mail, gains: Gains) -> tuple[Memory, Mail]:
-    """One round of all agents: what they remember, and what stands at each end of a link."""
-    y, pairs = _normal(memory.y, units), len(plan.floats)
+    def silence(self) -> Mail:
+        """The mail before anything was said; leading axis P."""
+        p, pairs = self.plan.width, len(self.talker)
+        matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
+        return Mail(matrix, vector, number - 1.0, number, number + jnp.inf, Proof(matrix, vector, number, number, number))
 
-    def turn(batch: Batch) -> tuple[Memory, Mail]:
-        agents, rows, ends, shared = batch.agents[0], batch.rows[0], batch.pairs[0], batch.shared[0]
-        multiplier = taken(memory.multiplier, batch.members[0], 0.0)
-        mine = Memory(jnp.moveaxis(taken(y, rows, 0.0), 1, -1), multiplier, *(leaf[agents] for leaf in memory[2:]))
-        p = shared.shape[1]
+    def across(self, mail: Mail) -> Mail:
+        """What stands at the other ends."""
+        return jax.tree.map(lambda leaf: pick(leaf, self.other), mail)
 
-        def at(values: Array, empty: float = 0.0) -> Array:
-            found = jnp.moveaxis(taken(values, ends, empty), 1, -1) if pairs else jnp.zeros((0, *values.shape[1:], len(agents)))
-            return found[(slice(None), *[slice(p)] * (values.ndim - 1))]
+    def begin(self, x: Array, gains: Gains) -> Memory:
+        """What the agents remember at the start, from first estimates (C, d)."""
 
-        heard = Mail(
-            at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
-            Proof(*map(at, inbox.proof)),
-        )  # fmt: skip
-        told, mail = step.act(_lanes(batch, units, gains), shared, rows < len(y), mine, heard, gains)
-        return _out(told), jax.tree.map(lambda leaf: _widened(leaf, plan.width), mail)
+        def start(batch: Batch) -> Memory:
+            y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
+            return _out(step.begin(_lanes(batch, self.units, gains), y))
 
-    found = [turn(batch) for batch in plan.batches]
-    mail = jax.tree.map(lambda *leaves: pick(jnp.concatenate(leaves), plan.pair), *[each[1] for each in found])
-    return _collected(plan, [each[0] for each in found], units), mail
+        return self._collected([start(batch) for batch in self.plan.batches])
+
+    def round(self, memory: Memory, inbox: Mail, margin: Array, gains: Gains) -> tuple[Memory, Mail]:
+        """One round: what the agents remember, and what stands at each end of a link.
+
+        Args:
+            memory: before.
+            inbox: what was last heard over each end.
+            margin: (N,) ᾱ_i where the bodies are.
+            gains: of the protocol.
+        """
+        units, pairs = self.units, len(self.talker)
+        y, told = _normal(memory.y, units), margin / units.psi
+
+        def turn(batch: Batch) -> tuple[Memory, Mail]:
+            agents, rows, ends, shared = batch.agents[0], batch.rows[0], batch.pairs[0], batch.shared[0]
+            multiplier = taken(memory.multiplier, batch.members[0], 0.0)
+            mine = Memory(jnp.moveaxis(taken(y, rows, 0.0), 1, -1), multiplier, *(leaf[agents] for leaf in memory[2:]))
+            p = shared.shape[1]
+
+            def at(values: Array, empty: float = 0.0) -> Array:
+                found = jnp.moveaxis(taken(values, ends, empty), 1, -1) if pairs else jnp.zeros((0, *values.shape[1:], len(agents)))
+                return found[(slice(None), *[slice(p)] * (values.ndim - 1))]
+
+            heard = Mail(
+                at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
+                Proof(*map(at, inbox.proof)),
+            )  # fmt: skip
+            found, mail = step.act(_lanes(batch, units, gains), shared, rows < len(y), mine, heard, told[agents], gains)
+            return _out(found), jax.tree.map(lambda leaf: _widened(leaf, self.plan.width), mail)
+
+        found = [turn(batch) for batch in self.plan.batches]
+        mail = jax.tree.map(lambda *leaves: pick(jnp.concatenate(leaves), self.plan.pair), *[each[1] for each in found])
+        return self._collected([each[0] for each in found]), mail
+
+    def least(self, inbox: Mail, margin: Array) -> Array:
+        """(N,) the least margin of the team that each agent knows of, given its own, (N,)."""
+        heard = jax.ops.segment_min(inbox.margin * self.units.psi, self.talker, len(margin), indices_are_sorted=True)
+        return jnp.minimum(margin, heard)
+
+    def _collected(self, found: list[Memory]) -> Memory:
+        """The answers of all batches, each where it belongs."""
+        plan = self.plan
+        whole = Memory(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+        agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "multiplier")}
+        x = self.units.center[None] + self.units.length * pick(whole.y, plan.row)
+        multiplier = pick(whole.multiplier, plan.member) if len(whole.multiplier) else jnp.zeros(0)
+        return Memory(y=x, multiplier=multiplier, **agents)
 
 
 def _normal(x: Array, units: Units) -> Array:
@@ -82,11 +147,3 @@ def _widened(leaf: Array, width: int) -> Array:
     leaf = jnp.moveaxis(leaf, -1, 1)
     leaf = leaf.reshape(-1, *leaf.shape[2:])
     return jnp.pad(leaf, [(0, 0), *[(0, width - size) for size in leaf.shape[1:]]])
-
-
-def _collected(plan: Plan, found: list[Memory], units: Units) -> Memory:
-    """The answers of all batches, each where it belongs."""
-    whole = Memory(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
-    agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "multiplier")}
-    x = units.center[None] + units.length * pick(whole.y, plan.row)
-    return Memory(y=x, multiplier=pick(whole.multiplier, plan.member), **agents)

@@ -132,10 +132,11 @@ class Shared:
         """What the agents with these copies share."""
         count = len(copies.own)
         here, there = _tree(copies.count, copies.edges, copies.own)
+        talk = copies.holder[copies.edges].astype(np.int64)
         keys = copies.holder[here].astype(np.int64) * count + copies.holder[there]
         span = spanning_tree(count, copies.links)
         level = np.concatenate([span[:, 0].astype(np.int64) * count + span[:, 1], span[:, 1].astype(np.int64) * count + span[:, 0]])
-        pairs = distinct(np.concatenate([keys, level]))
+        pairs = distinct(talk[:, 0] * count + talk[:, 1])
         pair = np.searchsorted(pairs, np.concatenate([keys, level]))
         position = np.concatenate([copies.position[here], np.full(len(level), count)])
         row = np.concatenate([here, np.full(len(level), -1)])

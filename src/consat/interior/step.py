@@ -16,6 +16,7 @@ from jax import Array
 
 from consat.interior.algebra import gram, reduced, solve, spread, times
 from consat.interior.layout import Batch, Form, Kind
+from consat.scale import Scale
 
 NUDGE = 1e-3
 """Copies begin by this part of the way from the own place to the first estimate, so that no two fall together."""
@@ -41,6 +42,11 @@ class Units(NamedTuple):
     length: Array
     psi: Array
     reach: Array
+
+    @classmethod
+    def of(cls, size: Scale) -> Units:
+        """From the natural size of a team."""
+        return cls(jnp.asarray(size.center), jnp.asarray(size.length), jnp.asarray(size.psi), jnp.asarray(size.reach / size.length))
 
 
 class Memory(NamedTuple):
@@ -281,7 +287,9 @@ def mean(multiplier: Array, s: Array, used: Array) -> Array:
     return jnp.sum(jnp.where(used, multiplier * s, 0.0), axis=0) / jnp.maximum(jnp.sum(used, axis=0), 1)
 
 
-def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, gains: Gains) -> tuple[Memory, Mail]:
+def act(
+    lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, told: Array, gains: Gains
+) -> tuple[Memory, Mail]:
     """A Newton step on own constraints and the neighbours' quadratics, then a quadratic and a proof for each neighbour.
 
     Args:
@@ -290,6 +298,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, g
         held: (n, A) false where copies are padded.
         memory: before.
         inbox: what was last heard.
+        told: (A,) the own margin where the bodies are.
         gains: of the protocol.
     """
     n, d, count = memory.y.shape
@@ -356,16 +365,24 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, g
     fine &= jnp.isfinite(left).all(axis=(1, 2)) & jnp.isfinite(e).all(axis=1)
     speaks = (some | jnp.isfinite(lowest)) & ~warm
     proof, bound = prove(lanes, shared, held, y, here, multiplier, inbox.proof)
-    behind = jnp.minimum(margin, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
+    behind = _least_of_others(jnp.concatenate([told[None], inbox.margin]))[1:]
     mail = Mail(
         jnp.where(fine[:, None, None], left, 0.0),
         jnp.where(fine[:, None], e, 0.0),
         jnp.where(speaks[None], barrier[None], -1.0) + jnp.zeros(fine.shape),
         level[None] + jnp.zeros(fine.shape),
-        behind[None] + jnp.zeros(fine.shape),
+        behind,
         proof,
     )
     return Memory(y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(memory.bound, bound), memory.age + 1), mail
+
+
+def _least_of_others(numbers: Array) -> Array:
+    """(k, A) → (k, A): for each number the least of the others."""
+    least, at = jnp.min(numbers, axis=0), jnp.argmin(numbers, axis=0)
+    mine = jnp.arange(len(numbers))[:, None] == at[None]
+    second = jnp.min(jnp.where(mine, jnp.inf, numbers), axis=0)
+    return jnp.where(mine, second[None], least[None])
 
 
 def model(

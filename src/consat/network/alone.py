@@ -84,6 +84,7 @@ class Alone(LocalSolver):
             links=OwnLinks.of(part),
             length=jnp.asarray(part.length),
             region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
+            interior=None,
             plan=prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1),
             nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
             local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),

@@ -188,9 +188,7 @@ class _Outline:
     def recall(self, x: Array, kappa: Array) -> Memory:
         return Memory(jnp.zeros(1), jnp.ones(1))
 
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, Memory, Array]:
+    def prox(self, v: Array, kappa: Array, x: Array, memory: Memory) -> tuple[Array, Memory, Array]:
         return v, memory, kappa
 
     def margin(self, x: Array) -> Array:

@@ -168,6 +168,7 @@ class Observer:
             satisfied_from=satisfied_from(steps, margins.min(axis=1), interpolate=False),
             messages=sent["messages"],
             floats_sent=sent["floats"],
+            known="satisfied" if known is not None else None,
             known_from=int(known) if known is not None and self.clock == "round" else None,
             seconds=seconds,
             violated=shares_of(self.team, position),

@@ -6,9 +6,9 @@ from typing import Any, Final
 
 from consat.errors import InvalidSettings
 from consat.protocols.admm import Admm
-from consat.protocols.base import Flow, Links, Local, Rounds, Solver, State
+from consat.protocols.base import Flow, Known, Links, Local, Rounds, Solver, State
 from consat.protocols.gradient_flow import GradientFlow
-from consat.protocols.max_min import MaxMin
+from consat.protocols.interior_point import InteriorPoint, max_min
 from consat.protocols.proportional_integral import ProportionalIntegral
 from consat.protocols.proximal import Proximal
 from consat.protocols.selfish import Selfish
@@ -17,7 +17,9 @@ from consat.settings import ProtocolSettings
 FLOWS: Final[Mapping[str, Callable[[], Flow]]] = {flow.name: flow for flow in (GradientFlow, ProportionalIntegral, Selfish)}
 """What ``--protocol`` may say of continuous time."""
 
-ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {rounds.name: rounds for rounds in (Admm, Proximal, MaxMin)}
+ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {
+    "interior-point": InteriorPoint, "max-min": max_min, "admm": Admm, "proximal": Proximal,
+}  # fmt: skip
 """What ``--protocol`` may say of rounds."""
 
 
@@ -30,6 +32,6 @@ def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
 
 
 __all__ = [
-    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Links", "Local", "MaxMin", "ProportionalIntegral", "Proximal", "Rounds", "Selfish",
+    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Known", "Links", "Local", "InteriorPoint", "ProportionalIntegral", "Proximal", "Rounds", "Selfish",
     "Solver", "State", "with_gains",
 ]  # fmt: skip

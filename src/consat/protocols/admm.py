@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.protocols.base import Solver
+from consat.protocols.base import Known, Solver
 from consat.prox import Memory
 
 
@@ -78,6 +78,7 @@ class Admm:
     fall: float = 0.2
     horizon: float = 50.0
     name = "admm"
+    speaks: ClassVar[str] = "link"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "u": "link", "wish": "row", "heard": "link", "penalty": "link", "memory": "agent"}
 
     def earliest(self, solver: Solver) -> int:
@@ -91,7 +92,7 @@ class Admm:
         return AdmmState(x, at_links, wish, level, level, solver.recall(x, wish))
 
     def speak(
-        self, state: AdmmState, solver: Solver, round_: Array, known: Array, sharper: Array | float = 1.0, above: Array | float = 0.0
+        self, state: AdmmState, solver: Solver, round_: Array, known: Known
     ) -> tuple[AdmmState, tuple[Array, Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
@@ -99,8 +100,8 @@ class Admm:
         u = links.at(x) + (u - links.at(x)) * (state.penalty / rho)[:, None]
         kappa, linked = links.sum(rho), links.degree > 0
         v = jnp.where(linked[:, None], links.sum(rho[:, None] * u) / jnp.where(linked, kappa, 1.0)[:, None], x)
-        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, wish), x, state.memory, sharper, above)
-        stiff = self.share * stiffness / jnp.sqrt(sharper)  # f_i stiffens along ∇ψ as ν², across it as ν: this is their geometric mean
+        x, memory, stiffness = solver.prox(v, jnp.where(linked, kappa, wish), x, state.memory)
+        stiff = self.share * stiffness
         unread = jnp.isnan(stiff)
 
         def followed() -> Array:
@@ -111,7 +112,7 @@ class Admm:
         least, across = self.least * self.penalty / solver.length**2, max(solver.hops, 1)
         horizon = self.horizon * across
         rise = self.rise * (1.0 + self.hurry * jnp.exp(jnp.minimum(memory.sigma, 0.0))) / (1.0 + (round_ / horizon) ** 4)
-        fall = jnp.where(known > 0, self.fall / across / (1.0 + (known / horizon) ** 4), 0.0)
+        fall = jnp.where(known.satisfied > 0, self.fall / across / (1.0 + (known.satisfied / horizon) ** 4), 0.0)
         lowest = wish * (1.0 - solver.to_rows(fall)) if solver.convex else wish
         wish = jnp.clip(jnp.maximum(goal, least), lowest, wish * (1.0 + solver.to_rows(rise)))
         here = links.at(x)

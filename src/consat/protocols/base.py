@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
+from consat.interior import Interior
 from consat.prox import Memory
 
 
@@ -70,6 +71,18 @@ class Flow(Protocol):
         ...
 
 
+class Known(NamedTuple):
+    """What an agent knows of the bodies; one number an agent.
+
+    Attributes:
+        satisfied: for how many rounds it has known that all are satisfied; see `consat.protocols.agreement`.
+        margin: ᾱ_i where its own body is and where it last heard that the others are.
+    """
+
+    satisfied: Array
+    margin: Array
+
+
 class Links(Protocol):
     """An agent's own ends of its links: one for each copy that it shares with a neighbour."""
 
@@ -119,6 +132,11 @@ class Solver(Protocol):
         """Whether every constraint of the team is known to be concave; common knowledge."""
         ...
 
+    @property
+    def interior(self) -> Interior:
+        """Its part in `consat.protocols.interior_point`; there if the protocol speaks to pairs."""
+        ...
+
     def nearby(self, x: Array) -> Array:
         """(rows, d) positions, brought to where the team's places are, which is common knowledge: unchanged inside, and from far away to
         their rim, keeping their directions. Rows that nothing ties to anything stay."""
@@ -128,11 +146,8 @@ class Solver(Protocol):
         """What its solver remembers before the first step from x, (rows, d), at weights κ, (rows,)."""
         ...
 
-    def prox(
-        self, v: Array, kappa: Array, x: Array, memory: Memory, sharper: Array | float = 1.0, above: Array | float = 0.0
-    ) -> tuple[Array, Memory, Array]:
-        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖², with ν multiplied by `sharper` and f_i = e^{−ν_β (α_i − above)} / `sharper`;
-        `above` is one number an agent, or one for all.
+    def prox(self, v: Array, kappa: Array, x: Array, memory: Memory) -> tuple[Array, Memory, Array]:
+        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖².
 
         Returns:
             (rows, d) the solution, the solver's memory, and (rows,) the mean diagonal of ∇²f_i, NaN where no constraint reads a row.
@@ -157,7 +172,12 @@ class Rounds(Protocol):
 
     @property
     def per(self) -> Mapping[str, Any]:
-        """For each field of the state, what it has one of: ``row``, ``link`` or ``agent``."""
+        """For each field of the state, what it has one of: ``row``, ``link``, ``agent``, ``pair`` of neighbours, or ``constraint``."""
+        ...
+
+    @property
+    def speaks(self) -> str:
+        """What a message has one row of: ``link``, for each copy that two neighbours share, or ``pair``, for each neighbour."""
         ...
 
     @property
@@ -173,14 +193,14 @@ class Rounds(Protocol):
         """The state with which an agent begins from first estimates x; its field ``x`` holds its estimates from then on."""
         ...
 
-    def speak(self, state: Any, solver: Solver, round_: Array, known: Array) -> tuple[Any, Any]:
-        """Its step, and its message: arrays with one row a link.
+    def speak(self, state: Any, solver: Solver, round_: Array, known: Known) -> tuple[Any, Any]:
+        """Its step, and its message: arrays with one row of what `speaks` says.
 
         Args:
             state: own.
             solver: own.
             round_: which round it is, from 0.
-            known: for how many rounds it has known that all are satisfied, one number an agent; see `consat.protocols.agreement`.
+            known: of the bodies.
         """
         ...
 

@@ -1,4 +1,24 @@
-"""Interior point by message passing (design, section 8; after Khoshfetrat Pakazad, Hansson, Andersen, arXiv 1502.06384, without sweeps)."""
+"""Max-min by an interior point whose Newton steps are passed along as quadratics, one hop a round (after Khoshfetrat Pakazad, Hansson,
+Andersen, arXiv 1502.06384, who sweep the whole tree for each step).
+
+    max t   subject to   ψ_ik(x) ≥ t
+
+has strictly feasible points wherever the team is: lower t. Agent i holds copies y of the positions it needs, a level t_i, multipliers
+λ_ik > 0 and a barrier μ_i. In each round, with s_k = ψ_k(y) − t_i > 0 and a_k = (∇ψ_k, −1),
+
+    M   = Σ_k (λ_k/s_k) a_k a_kᵀ − Σ_k λ_k ∇²ψ_k + κ I,     g = −e_t − Σ_k (μ_i/s_k) a_k
+    Δ   = −(M + A)⁻¹ (g + A y − b),                          A, b: the neighbours' last quadratics ½ zᵀLz − eᵀz, added up
+    y⁺  = y + α Δ,   λ⁺ = λ + (μ/s − λ − (λ/s) aᵀΔ),         cut so that a part of every slack and multiplier is left
+    μ⁺  = max(σ λ·s/m,  floor,  μ_j/3,  0.3 |t_j − t_i|)
+    send j:  the quadratic of M + A − A_j, minimised over all variables not shared with j;  μ_i, t_i
+
+A lost message leaves the last one in force; nothing has to be in step. Of ∇²ψ only the concave part counts. The level travels along a
+spanning tree, and with it a proof: Σ λψ of everything behind the sender, maximised likewise. Own plus all that came is a bound on the best
+margin of the whole team, whatever was lost, late or stale, since any multipliers give one. An agent whose bound is below zero knows that
+the team cannot be satisfied.
+
+With a cap the level is at most that: no more margin is asked for, and far parts of a team need not agree on t. `max-min` has none.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +31,43 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.interior import Gains, Mail, Memory
+from consat.protocols.base import Known, Solver
 
 
 class InteriorState(NamedTuple):
-    x: Array
+    """What an agent remembers.
+
+    Attributes:
+        memory: of its own problem, its estimates among it.
+        inbox: what it last heard over each end of a link.
+    """
+
     memory: Memory
     inbox: Mail
+
+    @property
+    def x(self) -> Array:
+        """(rows, d) its estimates."""
+        return self.memory.y
 
 
 @dataclass(frozen=True)
 class InteriorPoint:
+    """See the module.
+
+    Attributes:
+        cap: of the level, in the team's unit of ψ; None for the exact max-min.
+        inertia: κ, in units of ∇²ψ: keeps agents where they are that have what they need.
+        centering: σ.
+        boundary: the part of any slack or multiplier that a step may take.
+        floor: of μ, relative to the level or in the team's unit of ψ.
+        couple: μ_i is at least a neighbour's over this.
+        apart: μ_i is at least this part of how far levels differ.
+        drop: an agent comes down at once to the lowest level heard, if that is below by more than so many times its least slack.
+        warm: rounds in which the mean of the margins is maximised first.
+        name: what ``--protocol`` calls it.
+    """
+
     cap: float | None = 0.1
     inertia: float = 0.1
     centering: float = 0.5
@@ -30,24 +77,39 @@ class InteriorPoint:
     apart: float = 0.3
     drop: float = 3.0
     warm: int = 0
-    damp: float = 0.0
-    name = "interior-point"
+    name: str = "interior-point"
+    speaks: ClassVar[str] = "pair"
+    per: ClassVar[Mapping[str, Any]] = {
+        "memory": {"y": "row", "multiplier": "constraint", **dict.fromkeys(Memory._fields[2:], "agent")},
+        "inbox": "pair",
+    }
 
     @property
     def gains(self) -> Gains:
+        """What a step needs to know of them."""
         return Gains(self.cap, self.inertia, self.centering, self.boundary, self.floor, self.couple, self.apart, self.drop, self.warm)
 
-    def start(self, x: Array, solver: Any) -> InteriorState:
-        x = solver.nearby(x)
-        memory = solver.begin(x, self.gains)
-        return InteriorState(memory.y, memory._replace(y=jnp.zeros((0, x.shape[1]))), solver.silence())
+    def earliest(self, solver: Solver) -> int:
+        return solver.hops
 
-    def speak(self, state: InteriorState, solver: Any, round_: Array, known: Array) -> tuple[InteriorState, Mail]:
-        memory, mail = solver.round(state.memory._replace(y=state.x), state.inbox, self.gains)
-        return state._replace(x=memory.y, memory=memory._replace(y=jnp.zeros((0, state.x.shape[1])))), mail
+    def start(self, x: Array, solver: Solver) -> InteriorState:
+        return InteriorState(solver.interior.begin(solver.nearby(x), self.gains), solver.interior.silence())
 
-    def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Any) -> InteriorState:
+    def speak(self, state: InteriorState, solver: Solver, round_: Array, known: Known) -> tuple[InteriorState, Mail]:
+        memory, mail = solver.interior.round(state.memory, state.inbox, known.margin, self.gains)
+        return InteriorState(memory, state.inbox), mail
+
+    def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Solver) -> InteriorState:
         def take(new: Array, old: Array) -> Array:
             return jnp.where(arrived.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         return state._replace(inbox=jax.tree.map(take, message, state.inbox))
+
+    def proven(self, state: InteriorState, solver: Solver, margin: Array) -> tuple[Array, Array]:
+        """What each agent knows of the whole team: (N,) a bound on its best margin, and (N,) the margin it has; `margin`: (N,) own."""
+        return state.memory.bound * solver.interior.units.psi, solver.interior.least(state.inbox, margin)
+
+
+def max_min() -> InteriorPoint:
+    """The same without a cap."""
+    return InteriorPoint(cap=None, name="max-min")

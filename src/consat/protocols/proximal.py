@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from consat.protocols.base import Solver
+from consat.protocols.base import Known, Solver
 from consat.prox import Memory
 
 
@@ -47,6 +47,7 @@ class Proximal:
 
     step: float = 0.3
     name = "proximal"
+    speaks: ClassVar[str] = "link"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "z": "row", "heard": "link", "memory": "agent"}
 
     def earliest(self, solver: Solver) -> int:
@@ -56,7 +57,7 @@ class Proximal:
         x = solver.nearby(x)
         return ProximalState(x, jnp.zeros_like(x), solver.links.at(x), solver.recall(x, self._kappa(x, solver)))
 
-    def speak(self, state: ProximalState, solver: Solver, round_: Array, known: Array) -> tuple[ProximalState, Array]:
+    def speak(self, state: ProximalState, solver: Solver, round_: Array, known: Known) -> tuple[ProximalState, Array]:
         links = solver.links
         spread = links.sum(links.metropolis[:, None] * (links.at(state.x) - state.heard))
         x, memory, _ = solver.prox(state.x - spread - state.z, self._kappa(state.x, solver), state.x, state.memory)

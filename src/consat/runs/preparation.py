@@ -7,12 +7,14 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from consat.central.certificate import bounds
 from consat.central.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings, counted
-from consat.estimates import Estimates
+from consat.estimates import Estimates, Layout
+from consat.interior import route_of
 from consat.objective import Schedule
 from consat.protocols import FLOWS, ROUNDS
 from consat.scale import Scale, automatic, scale, start_box
@@ -20,7 +22,13 @@ from consat.scenario import Scenario, dump, load
 from consat.settings import Settings, Start
 from consat.teams.team import Team
 
-DEFAULT_PROTOCOL = "admm"
+DEFAULT_PROTOCOL = "interior-point"
+MANY = 20_000
+"""Teams of more agents than these run admm where nobody says: its rounds take less time."""
+FULL = 30
+"""Likewise teams of more agents than these where everybody holds everything."""
+PAIRED = ("interior-point", "max-min")
+"""Protocols that speak to each neighbour as a whole, not copy by copy."""
 SHARP = 5e-4
 """Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
 
@@ -45,14 +53,23 @@ def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
     return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
 
 
-def settings_of(asked: Settings, given: Mapping[str, Any]) -> Settings:
-    """What the scenario asks for, and `given` overrides.
+def default_protocol(team: Team, layout: Layout) -> str:
+    """The protocol of a team for which nobody names one: interior-point; admm where its messages would be too wide or too many, and where
+    several processes run one team."""
+    if jax.process_count() > 1 or team.count > MANY or (layout == "full" and team.count > FULL):
+        return "admm"
+    return DEFAULT_PROTOCOL
+
+
+def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settings:
+    """What the scenario asks for, and `given` overrides; the default protocol is that of the team.
 
     Raises:
         InvalidSettings: there is no such protocol.
     """
     start, seed = given["start"], given["seed"]
-    kind, estimates = given["protocol"] or asked.protocol.kind or DEFAULT_PROTOCOL, given["estimates"] or asked.protocol.estimates
+    estimates = given["estimates"] or asked.protocol.estimates
+    kind = given["protocol"] or asked.protocol.kind or default_protocol(team, estimates)
     settings = asked.model_copy(
         update={
             "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
@@ -87,7 +104,9 @@ class Prepared(NamedTuple):
         """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
         size = scale(team)
         schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-        return cls(team, Estimates.of(team, settings.protocol.estimates), schedule, size, settings)
+        layout = settings.protocol.estimates
+        copies = route_of(team, layout)[1] if settings.protocol.kind in PAIRED else Estimates.of(team, layout)
+        return cls(team, copies, schedule, size, settings)
 
     def first(self, start: Start | None = None) -> np.ndarray:
         """(C, d) first estimates, drawn as the settings say, or otherwise."""

@@ -152,7 +152,7 @@ def _start(
     }
     if given["auxiliary"] is not None:
         scenario = with_auxiliary(scenario, given["auxiliary"])
-    settings = settings_of(scenario.settings, given)
+    settings = settings_of(scenario.settings, given, scenario.team)
     kind = settings.protocol.kind
     until, rounds, loss, sleep, rate, speed = (given[key] for key in ("until", "rounds", "loss", "sleep", "rate", "speed"))
     default = "never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied"

@@ -51,6 +51,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
             "time": None if trace.satisfied_from is None or period is None else trace.satisfied_from * period,
             "round": None if trace.satisfied_from is None or trace.clock != "round" else int(trace.satisfied_from),
         },
+        "known": trace.known,
         "known_from": trace.known_from,
         "rounds": int(trace.steps[-1]) if trace.clock == "round" else None,
         "time": float(trace.steps[-1]) if trace.clock == "time" else None,

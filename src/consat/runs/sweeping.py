@@ -220,7 +220,7 @@ class _Asked:
         scenario = loads(self.scenario.text, self.scenario.source, overrides) if overrides else self.scenario
         if self.auxiliary is not None:
             scenario = with_auxiliary(scenario, self.auxiliary)
-        settings = settings_of(scenario.settings, self.given)
+        settings = settings_of(scenario.settings, self.given, scenario.team)
         kind = settings.protocol.kind
         if (kind in FLOWS and (self.rounds or self.loss or self.sleep)) or (kind in ROUNDS and self.until):
             raise InvalidSettings(
@@ -267,7 +267,7 @@ class _Asked:
             key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None
         }
         loss, sleep = combination.weather
-        world = world_of(ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None)
+        world = world_of(ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks)
         default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
         rules = Rules(
             end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,

@@ -128,7 +128,7 @@ class ManyProcesses:
         chunk = self._seen(book, now.body, np.zeros(1, dtype=int), 1)
         return _State(now, 0), chunk
 
-    def advance(self, state: _State, number: int, count: int, streak: int, every: int) -> tuple[_State, Chunk]:
+    def advance(self, state: _State, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[_State, Chunk]:
         now, run = state.now, _compiled()
         book = run.empty(now, jnp.asarray(self._rows.mine))
         for k in range(count):
@@ -140,10 +140,11 @@ class ManyProcesses:
         numbers = np.arange(number + 1, number + 1 + count)
         chunk = self._seen(book, state.now.body, np.flatnonzero(numbers % every == 0), count)
         if self._hold is not None:
+            satisfied = streak[0]
             for k, margin in enumerate(chunk.margin[:count]):
-                streak = streak + 1 if margin > 0 else 0
-                if streak >= self._hold and k + 1 < count:  # it ended within the chunk: go there again
-                    return self.advance(state, number, k + 1, streak - k - 1, every)
+                satisfied = satisfied + 1 if margin > 0 else 0
+                if satisfied >= self._hold and k + 1 < count:  # it ended within the chunk: go there again
+                    return self.advance(state, number, k + 1, (satisfied - k - 1, 0), every)
         return _State(now, number + count), chunk
 
     def _seen(self, book: _Book, anchor: Array, kept: np.ndarray, count: int) -> Chunk:
@@ -161,7 +162,8 @@ class ManyProcesses:
             done=count,
             margin=margin.min(axis=0),
             smooth_margin=-np.logaddexp.reduce(-nu * smooth, axis=0) / nu,
-            known=known.min(axis=0) > 0,
+            known=(known.min(axis=0) > 0).astype(np.int64),
+            near=0,
             messages=messages.sum(axis=0).astype(np.int64),
             floats=floats.sum(axis=0).astype(np.int64),
             drift=drift[:, :count].max(),

@@ -22,6 +22,8 @@ CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
 LARGE = 200_000
 """Of more agents than these the rounds take longer than their program takes to compile well."""
+SURE = 3
+"""For so many rounds on end all must know what ends a run: what they have heard of the others' margins is some rounds old."""
 NEVER = 2**62
 """More rounds than there are."""
 SCALARS = ("margin", "smooth_margin", "known", "messages", "floats")
@@ -49,7 +51,8 @@ class Chunk(NamedTuple):
         done: how many.
         margin: (CHUNK,) β̄ after each.
         smooth_margin: (CHUNK,).
-        known: (CHUNK,) whether everybody knew that all were satisfied.
+        known: (CHUNK,) what everybody knew; see `consat.simulate.kernel.knowledge`.
+        near: for how many rounds everybody has known what ends the run.
         messages: (CHUNK,) sent.
         floats: (CHUNK,) sent.
         drift: how far any position was, on any axis, from where it was before; not finite if a position is not.
@@ -61,6 +64,7 @@ class Chunk(NamedTuple):
     margin: Any
     smooth_margin: Any
     known: Any
+    near: Any
     messages: Any
     floats: Any
     drift: Any
@@ -78,14 +82,15 @@ class Engine(Protocol):
         """The state before the first round, and what is seen of it."""
         ...
 
-    def advance(self, state: Any, number: int, count: int, streak: int, every: int) -> tuple[Any, Chunk]:
+    def advance(self, state: Any, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[Any, Chunk]:
         """Some rounds.
 
         Args:
             state: given up.
             number: of the first of them.
             count: how many.
-            streak: for how many rounds every margin has been positive; the rounds end when they are enough, if that ends the run.
+            streak: for how many rounds every margin has been positive, and for how many all have known what ends the run; the rounds end
+                when either are enough, if that ends the run.
             every: each how manieth round to keep.
         """
         ...
@@ -143,17 +148,20 @@ def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Arr
     kept = Kept(*(jnp.expand_dims(leaf, 0) for leaf in chosen.of_seen(seen)))
     scalars = {name: getattr(seen, name)[None] for name in SCALARS}
     count = violated(world.observer, chosen.watched, now.body).astype(jnp.asarray(0).dtype)
-    return now, Chunk(jnp.asarray(1), **scalars, drift=jnp.max(jnp.abs(now.body), initial=0.0), violated=count, kept=kept)
+    return now, Chunk(jnp.asarray(1), **scalars, near=jnp.asarray(0), drift=jnp.max(jnp.abs(now.body), initial=0.0), violated=count, kept=kept)
 
 
 class Ask(NamedTuple):
-    """Of the arguments of `Engine.advance` the numbers, and `hold`: how many satisfied rounds on end end the run."""
+    """Of the arguments of `Engine.advance` the numbers; `hold`: how many satisfied rounds on end end the run; and `knowing`: what all must
+    know, for `SURE` rounds on end, to end it, as bits; see `consat.simulate.kernel.knowledge`."""
 
     number: Array
     rounds: Array
     streak: Array
     every: Array
     hold: Array
+    near: Array
+    knowing: Array
 
 
 def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: Now, ask: Ask) -> tuple[Now, Chunk]:
@@ -166,7 +174,8 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         done=jnp.zeros_like(ask.rounds),
         margin=jnp.zeros(CHUNK, real),
         smooth_margin=jnp.zeros(CHUNK, real),
-        known=jnp.zeros(CHUNK, bool),
+        known=jnp.zeros(CHUNK, whole),
+        near=ask.near,
         messages=jnp.zeros(CHUNK, whole),
         floats=jnp.zeros(CHUNK, whole),
         drift=jnp.zeros((), real),
@@ -191,10 +200,11 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
         places = jnp.where((ask.number + at.done + 1) % ask.every == 0, at.places + 1, at.places)
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
-        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, drift=drift, violated=count, kept=kept))
+        near = jnp.where(seen[SCALARS.index("known")] & ask.knowing > 0, chunk.near + 1, 0)
+        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, near=near, drift=drift, violated=count, kept=kept))
 
     def goes_on(at: _Loop) -> Array:
-        return (at.done < ask.rounds) & (at.streak < ask.hold)
+        return (at.done < ask.rounds) & (at.streak < ask.hold) & (at.chunk.near < SURE)
 
     end = jax.lax.while_loop(goes_on, step, _Loop(empty.done, now, ask.streak, empty.done, empty))
     return end.now, end.chunk
@@ -230,10 +240,13 @@ class OneProcess:
         seed: of what goes wrong.
         choice: what is recorded.
         hold: how many satisfied rounds on end are the end; None if nothing of the kind is.
+        knowing: what all must know for the end; see `Ask`.
     """
 
-    def __init__(self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None) -> None:
-        self._first, self._seed, self._hold = first, seed, hold
+    def __init__(
+        self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None, knowing: int = 0
+    ) -> None:  # fmt: skip
+        self._first, self._seed, self._hold, self._knowing = first, seed, hold, knowing
         self._large = world.everyone.agents > LARGE
         self._protocol, self.world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
@@ -242,9 +255,9 @@ class OneProcess:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)
         return _compiled(self._large)[0](self._protocol, self.world, self._chosen, first, key)
 
-    def advance(self, state: Now, number: int, count: int, streak: int, every: int) -> tuple[Now, Chunk]:
+    def advance(self, state: Now, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[Now, Chunk]:
         hold = NEVER if self._hold is None else self._hold
-        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak, every, hold)))
+        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak[0], every, hold, streak[1], self._knowing)))
         return _compiled(self._large)[1](self._protocol, self.world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:

@@ -14,9 +14,10 @@ from jax import Array
 from consat import prox
 from consat.estimates import Estimates
 from consat.graphs import hops
+from consat.interior import Interior
 from consat.numerics import Groups, pick
 from consat.objective import Nu, Objective
-from consat.protocols import Rounds, agreement
+from consat.protocols import InteriorPoint, Known, Rounds, agreement
 from consat.scale import Region, Scale
 from consat.solver import EXACT, LocalSolver
 from consat.teams.family import distinct
@@ -176,7 +177,7 @@ class World:
         talker: (E,) who speaks at each end.
         pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
         reach: most that a body moves in a round; None if it can jump.
-        owners: see `consat.protocols.agreement`; None where bodies can jump, and are where the estimates are.
+        owners: see `consat.protocols.agreement`; None where bodies can jump and agents go by their estimates of one another.
         loss: see `Weather`.
         sleep: see `Weather`.
         pairs: how many directed pairs.
@@ -226,6 +227,7 @@ class Spoken(NamedTuple):
         heard: likewise.
         crossing: what stands at each end, on its way to the other: the protocol's message, the ages, (E,), and word of bodies, if any.
         went: (E,) whether it was sent and not lost; None where nothing is.
+        reached: (P,) the same of the message to each neighbour; None where nobody asks.
         key: of the random draws that follow.
         messages: sent.
         floats: sent.
@@ -237,6 +239,7 @@ class Spoken(NamedTuple):
     heard: agreement.Bodies | None
     crossing: tuple[Any, Array, agreement.Word | None]
     went: Array | None
+    reached: Array | None
     key: Array
     messages: Array
     floats: Array
@@ -252,9 +255,11 @@ def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     """The first half of a round."""
     everyone, ends = world.everyone, world.everyone.links
-    state, message = protocol.speak(now.state, everyone, round_, agreement.known(now.ages, everyone))
+    at = now.state.x if now.heard is None else now.heard.position
+    known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
+    state, message = protocol.speak(now.state, everyone, round_, known)
     ages, told = agreement.speak(now.ages, state.x, everyone)
-    key, went, awake = now.key, None, None
+    key, went, awake, reached = now.key, None, None, None
     sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
     counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
     if world.rough:
@@ -262,7 +267,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         state = _where_awake(protocol.per, world, awake, state, now.state)
         ages = _where_awake(_AGES, world, awake, ages, now.ages)
         goes = awake[world.talker]
-        went = goes & through[world.pair]
+        went, reached = goes & through[world.pair], through
         counted = goes if counted is None else goes & counted
     if counted is not None:
         sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
@@ -273,9 +278,13 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
         if awake is not None:
             heard = _where_awake(_BODIES, world, awake, heard, now.heard)
-    per_copy = jax.tree.leaves((message, () if word is None else (word.position, word.stale)))
+    per_copy = jax.tree.leaves((message if protocol.speaks == "link" else (), () if word is None else (word.position, word.stale)))
     floats = sent * (1 if word is None else 2) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
-    return Spoken(state, ages, body, heard, (message, told, word), went, key, sent, floats)
+    if protocol.speaks == "pair" and everyone.interior is not None:
+        talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
+        reached = talks if reached is None else talks & reached
+        floats += jnp.sum(jnp.where(talks, everyone.interior.plan.floats, 0))
+    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats)
 
 
 _AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
@@ -298,13 +307,45 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, Array]:
     """The second half of a round; tells also whether everybody knows that all are satisfied."""
     everyone, ends = world.everyone, world.everyone.links
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
-    message, told, word = jax.tree.map(ends.across, spoken.crossing)
-    state = protocol.hear(spoken.state, message, arrived, everyone)
+    message, told, word = spoken.crossing
+    told, word = jax.tree.map(ends.across, (told, word))
+    if protocol.speaks == "pair" and everyone.interior is not None and spoken.reached is not None:
+        interior = everyone.interior
+        state = protocol.hear(spoken.state, interior.across(message), pick(spoken.reached, interior.other), everyone)
+    else:
+        state = protocol.hear(spoken.state, jax.tree.map(ends.across, message), arrived, everyone)
     ages, heard = agreement.hear(spoken.ages, told, arrived), spoken.heard
     if heard is not None and word is not None and world.owners is not None:
         heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
     known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
-    return Now(state, ages, spoken.body, spoken.key, heard), jnp.all(known if world.part is None else known | ~world.part.ours)
+    now = Now(state, ages, spoken.body, spoken.key, heard)
+    return now, knowledge(protocol, world, now, known if world.part is None else known | ~world.part.ours)
+
+
+SATISFIED, INFEASIBLE, NEAR, BEST = 1, 2, 4, 8
+"""What all agents know, as bits: that all are satisfied; that the team cannot be satisfied (or that it is); and that its margin is proven to
+be near the best, or the best to `EXACTLY`."""
+NEARLY, EXACTLY = 0.05, 1e-3
+"""Near is within this part of the bound, or within `EXACTLY` in units of ψ; both of what the agents know."""
+
+
+def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Array:
+    """What all agents know, of `SATISFIED` and the others; `satisfied`: (N,) who knows that all are."""
+    everyone = world.everyone
+    known = jnp.where(jnp.all(satisfied), SATISFIED, 0)
+    if not isinstance(protocol, InteriorPoint) or everyone.interior is None:
+        return known
+    margin = everyone.margin(now.state.x if now.heard is None else now.heard.position)
+    bound, least = protocol.proven(now.state, everyone, margin)
+    gap, unit = bound - least, everyone.interior.units.psi
+    idle = jnp.isinf(margin) & (everyone.interior.degree == 0)
+    torn = bound < 0
+    proven = jnp.isfinite(bound)
+    near = proven & (gap <= jnp.maximum(NEARLY * jnp.abs(bound), EXACTLY * unit))
+    best = proven & (gap <= EXACTLY * jnp.maximum(unit, jnp.abs(bound)))
+    known += INFEASIBLE * (jnp.all(satisfied | torn | idle) & jnp.any(torn))
+    known += NEAR * (jnp.all(satisfied | (torn & near) | idle) & jnp.any(torn))
+    return known + BEST * jnp.all(best | idle)
 
 
 def _moved(body: Array, target: Array, reach: Array | None) -> Array:
@@ -325,6 +366,8 @@ def see(world: World, x: Array, body: Array, known: Array, messages: Array, floa
 def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
     """The new state of those awake, the old one of those asleep."""
     masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
+    if (interior := world.everyone.interior) is not None:
+        masks |= {"pair": awake[interior.talker], "constraint": awake[interior.owner]}
 
     def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
         if isinstance(per, str):
@@ -351,7 +394,7 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
     start = first[world.own]
     heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
     now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
-    return now, see(world, first, start, jnp.asarray(False), jnp.asarray(0), jnp.asarray(0))
+    return now, see(world, first, start, jnp.asarray(0), jnp.asarray(0), jnp.asarray(0))
 
 
 def precision_for(count: int) -> prox.Precision:
@@ -360,17 +403,19 @@ def precision_for(count: int) -> prox.Precision:
 
 
 def world_of(
-    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, partial: bool = False
+    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, speaks: str = "link",
+    partial: bool = False,
 ) -> World:
-    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; partial: whether it is of one process
-    among several, which must know whose messages to count."""
+    """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; speaks: see `consat.protocols.Rounds`;
+    partial: whether it is of one process among several, which must know whose messages to count."""
     receiver, sender, block = copies.ends()
     talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
         links=Ends.of(receiver, sender, block, copies.count),
         length=jnp.asarray(size.length),
         region=Region.of(size),
-        plan=prox.buckets(team, copies.rows, copies.count, convex),
+        plan=prox.buckets(team, copies.rows, copies.count, convex) if speaks == "link" else None,
+        interior=Interior.of(team, copies, size) if speaks == "pair" else None,
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
         holder=jnp.asarray(copies.holder),
@@ -394,7 +439,7 @@ def world_of(
         talker=jnp.asarray(talker),
         pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
         reach=None if reach is None else jnp.asarray(reach),
-        owners=None if reach is None else _owners(copies, receiver, sender, block),
+        owners=None if reach is None and speaks == "link" else _owners(copies, receiver, sender, block),
         loss=jnp.asarray(weather.loss),
         sleep=jnp.asarray(weather.sleep),
         pairs=len(pairs),

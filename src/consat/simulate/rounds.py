@@ -17,14 +17,16 @@ from consat.protocols import Rounds
 from consat.scale import Scale
 from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
-from consat.simulate.engine import CHUNK, Chunk, Engine, Kept, OneProcess
-from consat.simulate.kernel import Body, Weather, world_of
+from consat.simulate.engine import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
+from consat.simulate.kernel import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, world_of
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink, velocities
 from consat.simulate.violations import shares
 from consat.teams.team import Team
 from consat.trace import Ending, Trace
 
+ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
+"""What all must know for a run to end, for each stop rule."""
 HOLD = 10
 """How many rounds on end every margin must stay positive before a team counts as satisfied."""
 PATIENCE = 2000
@@ -43,6 +45,9 @@ class Tally(Steps):
 
     Attributes:
         streak: for how many rounds every margin has been positive.
+        near: for how many rounds all have known what ends the run; see `consat.simulate.engine.Ask`.
+        known: what all know; see `consat.simulate.kernel.knowledge`.
+        infeasible_from: the round from which all have known that the team cannot be satisfied, or None.
         last_bad: the last round whose margin was ≤ 0, or −1.
         last_unknown: the last round after which not everybody knew, or −1.
         messages: sent.
@@ -53,12 +58,15 @@ class Tally(Steps):
     """
 
     streak: int = 0
+    near: int = 0
     last_bad: int = -1
     last_unknown: int = -1
     messages: int = 0
     floats: int = 0
     smooth_margin: float = np.nan
     asked: int = 0
+    known: int = 0
+    infeasible_from: int | None = None
     violated: Any = 0
 
     def add(self, chunk: Chunk) -> np.ndarray:
@@ -66,7 +74,11 @@ class Tally(Steps):
         count = int(chunk.done)
         numbers = np.arange(self.done + 1, self.done + 1 + count)
         margin, known = np.asarray(chunk.margin)[:count], np.asarray(chunk.known)[:count]
-        bad, unknown = np.flatnonzero(~(margin > 0)), np.flatnonzero(~known)
+        bad, unknown = np.flatnonzero(~(margin > 0)), np.flatnonzero(known & SATISFIED == 0)
+        torn = np.flatnonzero(known & INFEASIBLE)
+        if self.infeasible_from is None and len(torn):
+            self.infeasible_from = int(numbers[torn[0]])
+        self.known, self.near = int(known[-1]), int(chunk.near)
         self.streak = self.streak + count if not len(bad) else count - 1 - int(bad[-1])
         self.last_bad = int(numbers[bad[-1]]) if len(bad) else self.last_bad
         self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
@@ -137,8 +149,8 @@ def simulate_rounds(
 
         engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
     else:
-        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body)
-        engine = OneProcess(protocol, world, first, weather.seed, choice, hold)
+        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
+        engine = OneProcess(protocol, world, first, weather.seed, choice, hold, ENOUGH[stop])
     rules = Rules(
         end=PATIENCE if rounds is None else rounds, stop=stop, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
@@ -177,6 +189,8 @@ class Rules:
             return None
         if self.stop == "satisfied" and tally.streak >= HOLD:
             return "satisfied"
+        if tally.near >= SURE:
+            return "settled"
         if self.stop == "converged" and self.enough is not None and self.enough(positions()):
             return "settled"
         if tally.done < self.earliest or tally.drift > self.still:
@@ -212,7 +226,7 @@ class _Course:
 
     def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
         done = self.tally.done
-        state, chunk = self._engine.advance(state, done, min(CHUNK, self.end - done), self.tally.streak, every)
+        state, chunk = self._engine.advance(state, done, min(CHUNK, self.end - done), (self.tally.streak, self.tally.near), every)
         rows = self._count(chunk, every)
         return state, rows, self._rules.ending(self.tally, functools.partial(self.positions, state))
 
@@ -238,7 +252,16 @@ class _Course:
             "satisfied_from": float(tally.last_bad + 1) if tally.last_bad < tally.done else None,
             "messages": tally.messages,
             "floats_sent": tally.floats,
-            "known_from": tally.last_unknown + 1 if tally.last_unknown < tally.done else None,
+            **_known(tally),
             "period": self._period,
             "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
         }
+
+
+def _known(tally: Tally) -> Mapping[str, Any]:
+    """What all agents know at the end, and since when."""
+    if tally.known & SATISFIED:
+        return {"known": "satisfied", "known_from": tally.last_unknown + 1}
+    if tally.known & INFEASIBLE:
+        return {"known": "infeasible", "known_from": tally.infeasible_from}
+    return {"known": None, "known_from": None}
