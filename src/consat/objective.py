@@ -28,6 +28,9 @@ from consat.settings import Ramp, Smoothing
 from consat.teams.family import Family
 from consat.teams.team import Team
 
+STEEPEST = 600.0
+"""ln f_i beyond this is held at it where f_i itself is needed: what overflowed would be NaN where it is multiplied by a weight of 0."""
+
 
 class Nu(NamedTuple):
     """The smoothing ν_α, ν_β > 0 in force, in units of 1/ψ."""
@@ -199,7 +202,7 @@ class Objective:
         """(rows, d) ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)."""
 
         def force(log_h: Array, weights: Array) -> Array:
-            return -nu.beta * self.owners.spread(jnp.exp(nu.beta / nu.alpha * log_h)) * weights
+            return -nu.beta * self.owners.spread(jnp.exp(jnp.minimum(nu.beta / nu.alpha * log_h, STEEPEST))) * weights
 
         return self._added_up(x, nu, force)
 

@@ -115,3 +115,18 @@ def test_restricted_keeps_order_and_names() -> None:
     assert list(team.names) == ["near(a1)", "within"]
     assert team.owner.tolist() == [1, 2]
     assert sorted(np.concatenate([family.number for family in team.families])) == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("psi", "margin"), [("-1 + 0*norm2(a)", -1.0), ("0*norm2(a)", 0.0), ("0*exp(norm2(a))", 0.0), ("tanh(0*norm2(a)) - 1", -1.0)]
+)
+def test_a_constant_is_told_as_any_other(psi: str, margin: float) -> None:
+    """Nothing is divided by a slope or a size that is 0; warnings are errors here."""
+    (said,) = sentences(cs.Team([A("a", [cs.expr(psi)]), A("b", [cs.near("a", 1)])]))
+    assert f"a's expr cannot hold: the best margin is {margin:.4g}".replace("-", "−") in said
+    assert "Letting ψ of a's expr fall short of 0 by" in said
+
+
+def test_where_nothing_is_a_number_no_cure_is_sought() -> None:
+    (said,) = sentences(cs.Team([A("a", [cs.expr("log(-1 - norm2(a))"), cs.within([0, 0], 1)])]))
+    assert said == "No formation was found at which ψ of a's expr is a finite number."

@@ -93,13 +93,16 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
         return _about_the_worst(team, x, nu, refine)
     with np.errstate(over="ignore", invalid="ignore"):
         model = expand(team, x) if np.isfinite(x).all() else None
+        lower = -np.inf if model is None else float(model.value.min())
+        if model is not None and lower == -np.inf:  # what is proven elsewhere holds all the same
+            model = expand(team, middle(team))
         if model is None or not np.isfinite(model.value).all():
             return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
         proof = _Proof(team, model)
         proof.ladder(nu, multipliers)
         if refine:
             proof.climb()
-    lower, upper = float(model.value.min()), float(proof.upper.min())
+    upper = float(proof.upper.min())
     verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper <= 0 else "undecided"
     heavy = np.flatnonzero(proof.best > BINDING)
     order = heavy[np.argsort(-proof.best[heavy], kind="stable")]
@@ -162,7 +165,7 @@ class _Proof:
 
     def weights(self, values: Floats, nu: Floats | float) -> Floats:
         """Softmax weights of the concave constraints within each cluster."""
-        exponent = np.where(self.concave, -nu * values, -np.inf)
+        exponent = np.where(self.concave & np.isfinite(values), -nu * values, -np.inf)
         top = np.full(self.count, -np.inf)
         np.maximum.at(top, self.group, exponent)
         return normalised(np.exp(exponent - np.where(np.isfinite(top), top, 0.0)[self.group]), self.group, self.count)
@@ -184,7 +187,7 @@ class _Proof:
         model = self.model
         central = expand(self.team, middle(self.team)).keep(self.concave)
         soft = 1.0 / self.psi
-        ahead = self.smooth(np.nan_to_num(central.value, nan=-np.inf), soft) > self.smooth(model.value, soft)
+        ahead = self.smooth(central.value, soft) > self.smooth(model.value, soft)
         if ahead.any():
             model = expand(self.team, np.where(ahead[self.cluster][:, None], central.at, model.at)).keep(self.concave)
         for rung in REFINEMENT:
@@ -258,7 +261,8 @@ class _Proof:
         bound = np.bincount(self.group, np.where(weights > 0, terms, 0.0), minlength=self.count)
         bound += np.bincount(self.cluster, reach, minlength=self.count)
         total = np.bincount(self.group, weights, minlength=self.count)
-        bound = np.where((total > 0.5) & ~np.isnan(bound), np.maximum(bound, self.margins), np.inf)
+        unknown = np.bincount(self.group, (weights > 0) & ~model.known, minlength=self.count) > 0  # no tangent, no bound
+        bound = np.where((total > 0.5) & ~unknown & ~np.isnan(bound), np.maximum(bound, self.margins), np.inf)
         better = bound < self.upper
         self.upper = np.where(better, bound, self.upper)
         self.best = np.where(better[self.group], weights, self.best)

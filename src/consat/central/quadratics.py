@@ -2,7 +2,8 @@
 
     ψ_k(x₀ + y) = c_k + b_k·y + ½ yᵀH_k y,    c_k = ψ_k(x₀),  b_k = ∇ψ_k(x₀)
 
-is exact for constraints of degree ≤ 2. It is taken about a formation near the answer rather than about the origin, where the
+is exact for constraints of degree ≤ 2. A ψ that is −∞ there, or has no slope that can be computed with, is left out (see
+`consat.constraints.domain`). It is taken about a formation near the answer rather than about the origin, where the
 coefficients of a team far out (a disc of radius 1 at 1e6) would have lost their digits.
 """
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from consat.constraints.curvature import Curvature, hessians, read_curvatures
+from consat.constraints.domain import HUGE, Extended
 from consat.numerics import float64, once
 from consat.teams.family import Family
 from consat.teams.team import Team
@@ -104,8 +106,8 @@ class Expansion:
 
     Attributes:
         at: (N, d) the formation x₀, length.
-        value: (M,) c, in the team's order.
-        blocks: family by family.
+        value: (M,) c, in the team's order; −∞ where ψ is no finite number.
+        blocks: family by family, of those that have an expansion.
     """
 
     at: Floats
@@ -121,6 +123,14 @@ class Expansion:
         """Only the constraints (M,) asked for; the others keep their places and have no effect."""
         blocks = (block.take(constraints[block.number]) for block in self.blocks)
         return Expansion(self.at, self.value, tuple(block for block in blocks if len(block.number)))
+
+    @property
+    def known(self) -> Bools:
+        """(M,) which constraints it holds an expansion of."""
+        found = np.zeros(len(self.value), dtype=bool)
+        for block in self.blocks:
+            found[block.number] = True
+        return found
 
     def values(self, y: Floats) -> Floats:
         """(M,) of the expansion at x₀ + y, y of shape (N, d); those left out by `keep` stay at c."""
@@ -172,10 +182,12 @@ _Device = tuple[jax.tree_util.Partial, Array, dict[str, Array], Array]
 
 @jax.jit
 def _tangents(family: _Device, arguments: Array) -> tuple[Array, Array]:
-    def member(arguments: Array, parameters: dict[str, Array], weight: Array) -> Array:
-        return weight * family[0](*arguments, **parameters)
+    def member(arguments: Array, parameters: dict[str, Array], weight: Array) -> tuple[Array, Array]:
+        value, slope = jax.value_and_grad(lambda at: weight * family[0](*at, **parameters))(arguments)
+        usable = (jnp.abs(value) <= HUGE) & jnp.all(jnp.abs(slope) <= HUGE)
+        return jnp.where(jnp.isfinite(value), value, -jnp.inf), jnp.where(usable, slope, jnp.nan)
 
-    return jax.vmap(jax.value_and_grad(member))(arguments, family[2], family[3])
+    return jax.vmap(member)(arguments, family[2], family[3])
 
 
 @jax.jit
@@ -186,9 +198,9 @@ def _first_order(families: list[_Device], x: Array) -> list[tuple[Array, Array]]
 @jax.jit
 def _second_order(psi: jax.tree_util.Partial, agents: Array, parameters: dict[str, Array], weight: Array, x: Array) -> Array:
     def member(flat: Array, parameters: dict[str, Array], weight: Array) -> Array:
-        return weight * psi(*flat.reshape(agents.shape[1], x.shape[1]), **parameters)
+        return weight * Extended(psi)(*flat.reshape(agents.shape[1], x.shape[1]), **parameters)
 
-    return jax.vmap(jax.hessian(member))(x[agents].reshape(agents.shape[0], -1), parameters, weight)
+    return jax.vmap(jax.jacfwd(jax.grad(member)))(x[agents].reshape(agents.shape[0], -1), parameters, weight)
 
 
 @functools.lru_cache(maxsize=16)
@@ -215,7 +227,8 @@ def _columns(team: Team) -> tuple[Ints, ...]:
 
 @float64
 def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
-    """(M,) weighted ψ at (N, d) positions, and for each family (M_f, arity, d) its gradients."""
+    """(M,) weighted ψ at (N, d) positions, −∞ where it is no finite number; and for each family (M_f, arity, d) its gradients, NaN where
+    they can't be computed with."""
     total, gradients = np.zeros(len(team.owner)), []
     for family, (value, gradient) in zip(team.families, _first_order(_on_device(team), jnp.asarray(x)), strict=True):
         total[family.number] = np.asarray(value)
@@ -225,7 +238,7 @@ def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
 
 @float64
 def tangents(team: Team, family: int, arguments: Floats) -> tuple[Floats, Floats]:
-    """(M_f,) weighted ψ and (M_f, arity, d) gradients of a family at (M_f, arity, d) arguments of their own."""
+    """(M_f,) weighted ψ and (M_f, arity, d) gradients of a family at (M_f, arity, d) arguments of their own; as `values_and_gradients`."""
     value, gradient = _tangents(_on_device(team)[family], jnp.asarray(arguments))
     return np.asarray(value), np.asarray(gradient)
 
@@ -240,5 +253,8 @@ def expand(team: Team, at: Floats) -> Expansion:
         team.families, _on_device(team), _columns(team), gradients, shape_of(team).hessians, strict=True
     ):
         hessian = np.asarray(_second_order(*device, jnp.asarray(at))) if constant is None else constant
-        blocks.append(Block(family.number, columns, gradient.reshape(columns.shape), hessian))
+        whole = Block(family.number, columns, gradient.reshape(columns.shape), hessian)
+        block = whole.take(np.asarray(np.isfinite(whole.gradient).all(axis=1)))
+        if len(block.number) or not len(whole.number):
+            blocks.append(block)
     return Expansion(at, value, tuple(blocks))

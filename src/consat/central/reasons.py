@@ -76,9 +76,12 @@ def explain(team: Team, optimum: Optimum) -> list[str]:
     values = values_and_gradients(team, optimum.positions)[0]
     margins = cluster_margins(team, values, cluster)
     sentences: list[str] = []
-    for c in np.flatnonzero(np.isfinite(margins)):
+    for c in np.flatnonzero(margins < np.inf):
         mine = cluster[team.owner] == c
-        if margins[c] <= 0:
+        if margins[c] == -np.inf:
+            nowhere = np.flatnonzero(mine & (values == -np.inf)).tolist()
+            sentences.append(f"No formation was found at which ψ of {_listed(team, nowhere)} is a finite number.")
+        elif margins[c] <= 0:
             sentences += _conflict(team, optimum, mine, float(margins[c]))
     if not sentences:
         worst = int(np.argmin(margins))
@@ -99,8 +102,8 @@ def _conflict(team: Team, optimum: Optimum, mine: Bools, margin: float) -> Itera
     chosen = np.zeros(len(team.owner), dtype=bool)
     chosen[binding] = True
     if _infeasible(team, optimum, chosen):
-        both = "both" if len(binding) == 2 else "all"
-        sentence = f"{_listed(team, binding)} cannot {both} hold: the best margin is {_number(margin)}."
+        together = {1: "", 2: "both "}.get(len(binding), "all ")
+        sentence = f"{_listed(team, binding)} cannot {together}hold: the best margin is {_number(margin)}."
     elif _infeasible(team, optimum, mine):
         sentence = f"Not all constraints can hold: the best margin is {_number(margin)}. In the way are {_listed(team, binding)}."
     else:
@@ -118,7 +121,7 @@ def _cure(team: Team, multipliers: Floats, positions: Floats, margin: float) -> 
     """The least relaxation, of the constraint with the best leverage, that is seen to satisfy a cluster."""
     knobs = sorted(_knobs(team, multipliers, positions), key=lambda knob: -knob.gain * max(abs(knob.now), 1e-300))
     for knob in knobs[:TRIED]:
-        amount = _least(functools.partial(_margin, team, knob), -margin / knob.gain, LEAST * abs(knob.now), margin)
+        amount = _least(functools.partial(_margin, team, knob), -margin / knob.gain, LEAST * (abs(knob.now) or 1.0), margin)
         if amount is not None:
             return _proposal(team, knob, amount)
     return None
@@ -135,7 +138,7 @@ def _least(solve: Callable[[float], float], guess: float, least: float, margin: 
         above = solve(high)
         if above > 0:
             break
-        if above <= below + 1e-9 * abs(margin) and tries > 1:
+        if not math.isfinite(above) or (above <= below + 1e-9 * abs(margin) and tries > 1):
             return None  # it no longer helps: something else is in the way
         slope = (above - below) / (high - low)
         low, high, below = high, min(high + 1.05 * abs(above) / slope, 4 * high) if slope > 0 else 2 * high, above
@@ -174,14 +177,15 @@ def _knobs(team: Team, multipliers: Floats, positions: Floats) -> list[_Knob]:
                 for name in ("radius", "offset", "low", "high")
                 if name in parameters
                 for entry, slope in np.ndenumerate(slopes[name])
-                if slope != 0
+                if slope != 0 and math.isfinite(slope)
             ]
             if family.kind in STANDARD and options:
                 _, name, entry, slope = max(options)
                 now = float(parameters[name][entry])
                 knobs.append(_Knob(k, name, entry, now, multipliers[k] * weight * abs(slope), math.copysign(1.0, slope)))
             else:
-                size = float(np.abs(values_and_gradients(team, positions)[0]).max()) / weight
+                values = values_and_gradients(team, positions)[0]
+                size = float(np.abs(values[np.isfinite(values)]).max(initial=0.0)) / weight
                 knobs.append(_Knob(k, "", (), size, multipliers[k] * weight, 1.0))
     return knobs
 

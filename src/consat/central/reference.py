@@ -191,7 +191,7 @@ def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: 
     found = f"best of {count} starts, ν-continuation and sequential cone programs (Clarabel)"
     if not concave:
         return Optimum(best[0], float(best[2].min()), best[1], found, exact=False)
-    exact = bool(best[3].all())
+    exact = bool(best[3].all() and (best[2] > -np.inf).all())
     note = "concave constraints: exact" if exact else "concave constraints, not converged"
     return Optimum(best[0], float(best[2].min()), best[1], f"{note}, {found}", exact=exact)
 
@@ -208,10 +208,9 @@ def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools
         if solution.status != "solved":
             break
         multipliers = solution.multipliers
-        promised = cluster_margins(team, model.values(solution.step), cluster) - margins
-        values = values_and_gradients(team, x + solution.step)[0]
-        after = cluster_margins(team, np.where(np.isnan(values), -np.inf, values), cluster)
+        after = cluster_margins(team, values_and_gradients(team, x + solution.step)[0], cluster)
         with np.errstate(invalid="ignore"):  # a cluster without constraints has margin ∞ before and after
+            promised = np.where(margins == -np.inf, np.inf, cluster_margins(team, model.values(solution.step), cluster) - margins)
             settled = ~(promised > SETTLED * unit.psi)
             gain = after - margins
             accepted = gain > 0
@@ -229,7 +228,7 @@ def concave_part(model: Expansion) -> Expansion:
     """The same with the positive eigenvalues of every Hessian left out."""
     blocks = []
     for block in model.blocks:
-        eigenvalues, vectors = np.linalg.eigh(np.nan_to_num(block.hessian))
+        eigenvalues, vectors = np.linalg.eigh(block.hessian)
         negative = np.minimum(eigenvalues, 0.0)[:, None, :] * vectors
         blocks.append(dataclasses.replace(block, hessian=np.matmul(negative, np.swapaxes(vectors, 1, 2))))
     return Expansion(model.at, model.value, tuple(blocks))

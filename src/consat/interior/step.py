@@ -284,7 +284,12 @@ def centered(lanes: Lanes, psi: Array) -> tuple[Array, Array, Array, Array]:
 
 def mean(multiplier: Array, s: Array, used: Array) -> Array:
     """(A,) the mean of λ s over an agent's constraints."""
-    return jnp.sum(jnp.where(used, multiplier * s, 0.0), axis=0) / jnp.maximum(jnp.sum(used, axis=0), 1)
+    return jnp.sum(jnp.where(used, multiplier * s, 0.0), axis=0) / jnp.maximum(number(used), 1.0)
+
+
+def number(mask: Array) -> Array:
+    """(k, A) → (A,) how many."""
+    return jnp.sum(mask.astype(float), axis=0)
 
 
 def act(
@@ -395,7 +400,7 @@ def model(
     rows = jnp.concatenate([here.slopes, jnp.where(used, -1.0, 0.0)[:, None]], axis=1)
     pressed, stiff = jnp.where(used, barrier[None] / s, 0.0), jnp.where(used, multiplier / s, 0.0)
     if gains.warm:
-        share = jnp.where(used, 1.0 / jnp.maximum(jnp.sum(used[:-1], axis=0), 1), 0.0)
+        share = jnp.where(used, 1.0 / jnp.maximum(number(used[:-1]), 1.0)[None], 0.0)
         share = jnp.concatenate([share[:-1], jnp.zeros((1, count))])
         pressed, stiff, multiplier = (jnp.where(warm[None], a, b) for a, b in ((share, pressed), (0.0, stiff), (share, multiplier)))
     bent = gram(weights * multiplier[which], vectors) if len(which) else jnp.zeros((rows.shape[1] - 1, rows.shape[1] - 1, count))
@@ -459,12 +464,12 @@ def prove(
     curve = SLACK / reach**2
     own = (jnp.arange(size) < d)[:, None]
     absent = jnp.repeat(~held, d, axis=0, total_repeat_length=size)
-    matrix = matrix + jnp.eye(size)[:, :, None] * (jnp.where(own, 2 * curve * weight[None], 0.0) + absent)[:, None]
+    matrix = matrix + jnp.eye(size)[:, :, None] * (jnp.where(own, 2 * curve * weight[None], 0.0) + absent.astype(float))[:, None]
 
     places = jnp.where(shared < size, shared, size)  # the level is no variable of the proof
     outside, pull = spread(inbox.matrix, inbox.vector, places, size)
     neighbour, have = shared[:, 0] <= size, inbox.weight > 0
-    missing = jnp.sum(neighbour & ~have, axis=0)
+    missing = number(neighbour & ~have)
     total, forces = matrix + outside, vector + pull
     height = constant + curve * weight * reach**2 + jnp.sum(inbox.constant, axis=0)
     error = eps * sizes + jnp.sum(inbox.error, axis=0)
@@ -477,7 +482,7 @@ def prove(
     left, e, gain, fine = reduced(total, forces, places)
     left, e, constant = left - inbox.matrix, e - inbox.vector, height[None] - inbox.constant + gain
     error = error[None] - inbox.error + eps * (jnp.abs(constant) + jnp.abs(gain))
-    complete = missing[None] == (neighbour & ~have)
+    complete = missing[None] == (neighbour & ~have).astype(float)
     good = fine & complete & neighbour & jnp.isfinite(left).all(axis=(1, 2)) & jnp.isfinite(e).all(axis=1) & jnp.isfinite(constant)
     return Proof(
         jnp.where(good[:, None, None], left, 0.0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from consat.estimates import Estimates, Exchange
 from consat.numerics import float64, quick_compilation
 from consat.objective import Nu, Objective, Schedule
 from consat.protocols import Flow, State
+from consat.scale import scale
 from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
 from consat.simulate.loop import Steps, follow
@@ -38,6 +39,10 @@ MOST_IMPLICIT = 150
 """Up to this many numbers in the state an implicit solver is quicker, above an explicit one."""
 MOST_STEPS = 100_000
 """Solver steps between two looks, after which a flow counts as too stiff."""
+SHORTEST = 1e-12
+"""The shortest step of a solver, s."""
+ASTRAY = 1e6
+"""A flow whose states are so many times as large as the team and its start has diverged: it is stopped before they overflow."""
 
 
 @jax.tree_util.register_dataclass
@@ -50,18 +55,24 @@ class Problem:
         exchange: the messages.
         own: (C, 1) 1.0 where the holder's own position stands.
         schedule: of ν.
+        limit: states beyond it, in any entry, have diverged.
     """
 
     objective: Objective
     exchange: Exchange
     own: Array
     schedule: Schedule
+    limit: Array
 
     @classmethod
-    def of(cls, team: Team, estimates: Estimates, schedule: Schedule) -> Problem:
+    def of(cls, team: Team, estimates: Estimates, schedule: Schedule, limit: float = np.inf) -> Problem:
         objective = Objective.of(team, lambda family: estimates.rows(family.owner[:, None], family.agents), estimates.count)
         own = (estimates.holder == estimates.position)[:, None].astype(float)
-        return cls(objective, estimates.exchange(), jnp.asarray(own), schedule)
+        return cls(objective, estimates.exchange(), jnp.asarray(own), schedule, jnp.asarray(limit))
+
+    def astray(self, state: State) -> Array:
+        """Whether a state has diverged."""
+        return jnp.any(jnp.stack([jnp.any(~(jnp.abs(leaf) <= self.limit)) for leaf in jax.tree.leaves(state)]))
 
 
 @dataclass(frozen=True)
@@ -127,10 +138,31 @@ def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> Sta
     return flow.rate(state, local, problem.exchange.disagreement(flow.message(state)))
 
 
+class Advance(NamedTuple):
+    """An integration over some samples.
+
+    Attributes:
+        seen: the record of them; of those that were not reached, with no meaning.
+        wrong: (T, W) which watched constraints are violated there.
+        reached: (T,) which were.
+        state: at the end.
+        time: at the end, s.
+        astray: whether the state had diverged there.
+        moved: how far any position was, at a sample, from where it was at the start.
+    """
+
+    seen: Rows
+    wrong: Array
+    reached: Array
+    state: State
+    time: Array
+    astray: Array
+    moved: Array
+
+
 @functools.cache
-def _advance() -> Callable[..., tuple[Rows, Array, State, Array, Array]]:
-    """The compiled integration, from ``times[0]``: the record of ``times[1:]``, which watched constraints are violated there, the state at
-    the last of them, whether all went well, and how far any position was from where it was at the start."""
+def _advance() -> Callable[..., Advance]:
+    """The compiled integration, from ``times[0]`` over the samples ``times[1:]``, or to where it must end."""
     import diffrax
     import optimistix
 
@@ -140,7 +172,7 @@ def _advance() -> Callable[..., tuple[Rows, Array, State, Array, Array]]:
         # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
         return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
 
-    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> tuple[Rows, Array, State, Array, Array]:
+    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> Advance:
         anchor = state.x[observer.own]
 
         def look(t: Array, y: State, _: Any) -> tuple[Rows, Array, Array]:
@@ -156,17 +188,26 @@ def _advance() -> Callable[..., tuple[Rows, Array, State, Array, Array]]:
             dt0=None,
             y0=state,
             saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times[1:], fn=look), diffrax.SubSaveAt(t1=True)]),
-            stepsize_controller=diffrax.PIDController(rtol=1e-7, atol=1e-9, dtmin=1e-12, force_dtmin=False),
+            stepsize_controller=diffrax.PIDController(rtol=1e-7, atol=1e-9, dtmin=SHORTEST, force_dtmin=False),
             max_steps=MOST_STEPS,
             throw=False,
+            event=diffrax.Event(lambda t, y, _, **__: problem.astray(y)),
         )
         (seen, moved, wrong), last = solution.ys
-        # where the solver did not get
-        seen = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(moved).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan), seen)
-        wrong &= jnp.isfinite(moved)[:, None]
-        return seen, wrong, jax.tree.map(lambda leaf: leaf[-1], last), solution.result == diffrax.RESULTS.successful, jnp.max(moved)
+        end = jax.tree.map(lambda leaf: leaf[-1], last)
+        reached = jnp.isfinite(moved)
+        least = jnp.max(jnp.where(reached, moved, 0.0))
+        return Advance(seen, wrong & reached[:, None], reached, end, solution.ts[1][-1], problem.astray(end), least)
 
     return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
+
+
+_rate = jax.jit(rate, static_argnames=("flow",))
+
+
+def _largest(state: State) -> float:
+    """The largest entry; not finite if one is not."""
+    return float(max((np.abs(np.asarray(leaf)).max(initial=0.0) for leaf in jax.tree.leaves(state)), default=0.0))
 
 
 @functools.partial(jax.jit, static_argnames=("flow",))
@@ -211,7 +252,9 @@ def simulate_flow(
     choice = choice or Choice.of(team, estimates, estimates=record)
     end = PATIENCE if until is None else until
     grid = np.linspace(0.0, end, max(round(end / SAMPLE), 1) + 1)
-    problem, observer = Problem.of(team, estimates, schedule), Observer.of(team, estimates, choice)
+    size = scale(team)
+    limit = ASTRAY * (size.reach + float(np.abs(size.center).max(initial=0.0)) + float(np.abs(first).max(initial=0.0)))
+    problem, observer = Problem.of(team, estimates, schedule, limit), Observer.of(team, estimates, choice)
     known = "" if checkpoint is None else fingerprint(team, flow, schedule, first, estimates.layout, float(grid[1]))
     course = _Course(team, flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
     return follow(course, estimates, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=known, progress=progress)
@@ -266,23 +309,45 @@ class _Course:
     def start(self) -> tuple[State, Rows]:
         state = self.flow.start(jnp.asarray(self.first))
         rows = self.look(state)
-        self.tally.add(rows, violated(self.observer.objective, self.observer.watched, state.x[self.observer.own])[None])
+        self.tally.add(rows, self._violated(state))
         return state, rows
 
     def advance(self, state: State, every: int) -> tuple[State, Rows, Ending | None]:
         done = self.tally.done
         times = self.grid[done : done + CHUNK + 1]
         padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
-        seen, wrong, state, fine, moved = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
-        count = len(times) - 1
-        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], seen)._replace(step=times[1:])
-        self.tally.add(rows, np.asarray(wrong)[:count], float(moved))
-        rows = rows.where(np.arange(done + 1, done + 1 + count) % every == 0)
-        if fine:
-            return state, rows, self._ending(state)
-        if np.isfinite(self.tally.drift):
-            return state, rows, "too stiff"
-        return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state), rows, "diverged"
+        if not done and self._overflows(state):
+            return state, self.look(state).where(np.zeros(1, dtype=bool)), "diverged"
+        ahead = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
+        count = int(np.count_nonzero(np.asarray(ahead.reached)[: len(times) - 1]))
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], ahead.seen)._replace(step=times[1 : count + 1])
+        if count == len(times) - 1:
+            self.tally.add(rows, np.asarray(ahead.wrong)[:count], float(ahead.moved))
+            return ahead.state, rows.where(np.arange(done + 1, done + 1 + count) % every == 0), self._ending(ahead.state)
+        return self._early(state, ahead, rows, every)
+
+    def _violated(self, state: State) -> Array:
+        """(1, W) which watched constraints are violated."""
+        return violated(self.observer.objective, self.observer.watched, state.x[self.observer.own])[None]
+
+    def _overflows(self, state: State) -> bool:
+        """Whether even the shortest step would lead astray."""
+        largest = _largest(_rate(self.flow, self.problem, jnp.asarray(self.grid[0]), state))
+        return not largest * SHORTEST <= float(self.problem.limit)
+
+    def _early(self, before: State, ahead: Advance, rows: Rows, every: int) -> tuple[State, Rows, Ending]:
+        """The end of a flow that did not get to the next sample: at its last state that is finite."""
+        done, state = self.tally.done, ahead.state if np.isfinite(_largest(ahead.state)) else before
+        if len(rows.step):
+            self.tally.add(rows, np.asarray(ahead.wrong)[: len(rows.step)])
+        kept = rows.where(np.arange(done + 1, done + 1 + len(rows.step)) % every == 0)
+        ending: Ending = "diverged" if bool(ahead.astray) else "too stiff"
+        if float(ahead.time) > self.tally.time and state is ahead.state:
+            self.tally.time = float(ahead.time)
+            last = self.look(state)
+            self.tally.add(last, self._violated(state))
+            kept = kept.joined(last.where(np.array([self.tally.done % every == 0])))
+        return state, kept, ending
 
     def _ending(self, state: State) -> Ending | None:
         """Why the run should end now, or None."""

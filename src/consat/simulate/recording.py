@@ -59,6 +59,10 @@ class Rows(NamedTuple):
         """Some of the steps."""
         return Rows(*(None if leaf is None else leaf[chosen] for leaf in self))
 
+    def joined(self, more: Rows) -> Rows:
+        """These steps, and more."""
+        return Rows(*(None if leaf is None else np.concatenate([leaf, other]) for leaf, other in zip(self, more, strict=True)))
+
 
 @dataclass(frozen=True)
 class Choice:
