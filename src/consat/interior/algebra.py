@@ -75,7 +75,7 @@ def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Arra
     Returns:
         (N, N, A) and (N, A).
     """
-    lane = jnp.arange(shared.shape[-1])
+    lane = jnp.arange(shared.shape[-1], dtype=shared.dtype)
     whole = jnp.zeros((size, size, len(lane))).at[shared[:, :, None], shared[:, None], lane].add(matrix, mode="drop")
     return whole, jnp.zeros((size, len(lane))).at[shared, lane].add(vector, mode="drop")
 
@@ -95,7 +95,7 @@ def reduced(matrix: Array, vector: Array, shared: Array) -> tuple[Array, Array, 
     size, count = vector.shape
     g, p, _ = shared.shape
     shared = jnp.moveaxis(shared, 1, 0)  # (p, g, A)
-    stays = (jnp.arange(size)[:, None, None, None] == shared[None]).any(axis=1)  # (N, g, A)
+    stays = (jnp.arange(size, dtype=shared.dtype)[:, None, None, None] == shared[None]).any(axis=1)  # (N, g, A)
     inner = jnp.where(stays[:, None] | stays[None], jnp.eye(size)[:, :, None, None], matrix[:, :, None])
     there, inside = shared < size, jnp.minimum(shared, size - 1)
     whole = jnp.broadcast_to(matrix[:, :, None], (size, size, g, count))

@@ -213,7 +213,7 @@ class Lanes:
     def _placed(self, kind: Kind, slope: Array) -> Array:
         """(m, arity, d, A) → (m, n·d, A): on the copies that each constraint reads."""
         n, d, count = self.shape
-        where = jnp.arange(n)[None, None, :, None] == kind.slots[:, :, None]  # (m, arity, n, A)
+        where = jnp.arange(n, dtype=jnp.int32)[None, None, :, None] == kind.slots[:, :, None]  # (m, arity, n, A)
         return jnp.sum(jnp.where(where[:, :, :, None], slope[:, :, None], 0.0), axis=1).reshape(len(slope), n * d, count)
 
 
@@ -385,7 +385,7 @@ def act(
 def _least_of_others(numbers: Array) -> Array:
     """(k, A) → (k, A): for each number the least of the others."""
     least, at = jnp.min(numbers, axis=0), jnp.argmin(numbers, axis=0)
-    mine = jnp.arange(len(numbers))[:, None] == at[None]
+    mine = jnp.arange(len(numbers), dtype=at.dtype)[:, None] == at[None]
     second = jnp.min(jnp.where(mine, jnp.inf, numbers), axis=0)
     return jnp.where(mine, second[None], least[None])
 

@@ -133,8 +133,8 @@ class Solver(Protocol):
         ...
 
     @property
-    def interior(self) -> Interior:
-        """Its part in `consat.protocols.interior_point`; there if the protocol speaks to pairs."""
+    def interior(self) -> Interior | None:
+        """Its part in `consat.protocols.interior_point`; None unless the protocol speaks to pairs."""
         ...
 
     def nearby(self, x: Array) -> Array:

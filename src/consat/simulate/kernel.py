@@ -343,9 +343,10 @@ def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Arr
     proven = jnp.isfinite(bound)
     near = proven & (gap <= jnp.maximum(NEARLY * jnp.abs(bound), EXACTLY * unit))
     best = proven & (gap <= EXACTLY * jnp.maximum(unit, jnp.abs(bound)))
-    known += INFEASIBLE * (jnp.all(satisfied | torn | idle) & jnp.any(torn))
-    known += NEAR * (jnp.all(satisfied | (torn & near) | idle) & jnp.any(torn))
-    return known + BEST * jnp.all(best | idle)
+    some = jnp.any(torn)
+    known += jnp.where(jnp.all(satisfied | torn | idle) & some, INFEASIBLE, 0)
+    known += jnp.where(jnp.all(satisfied | (torn & near) | idle) & some, NEAR, 0)
+    return known + jnp.where(jnp.all(best | idle), BEST, 0)
 
 
 def _moved(body: Array, target: Array, reach: Array | None) -> Array:
