@@ -146,7 +146,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_run(typed, tmp_pa
 
 
 FORK = """
-import os, sys, warnings
+import os, signal, sys, warnings
 warnings.simplefilter("ignore")
 import consat as cs
 if sys.argv[1] == "jax":
@@ -158,6 +158,7 @@ elif sys.argv[1] == "consat":
 child = os.fork()
 if child:
     sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+signal.alarm(30)  # whoever hangs all the same ends
 try:
     told = cs.run("case-a", rounds=0).summary["rounds"]
 except cs.ConsatError as error:
