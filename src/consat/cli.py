@@ -110,7 +110,9 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @cli.command()
 @click.argument("scenario", metavar="FILE", required=False)
 @set_option
-@click.option("--protocol", metavar="KIND", help="interior-point (default), max-min, admm, proximal, gradient-flow, proportional-integral, selfish.")
+@click.option(
+    "--protocol", metavar="KIND", help="interior-point (default), max-min, admm, proximal, gradient-flow, proportional-integral, selfish."
+)
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
 @click.option("--rounds", type=click.IntRange(min=0), help="How many rounds; implies --stop never.")

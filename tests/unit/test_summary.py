@@ -98,5 +98,5 @@ def test_one_is_not_many() -> None:
     text = "\n".join([*(part for part in findings if isinstance(part, str)), str(run), str(cs.sweep(team, rounds=1))])
     assert "1 agent, 1 constraint, 1 cluster\n" in text
     assert "effort          1 round, 0 messages, 0 numbers sent" in text
-    assert "team: 1 run of admm" in text
+    assert "team: 1 run of interior-point" in text
     assert not re.findall(r"\b1 (?:agents|constraints|clusters|rounds|runs|seeds|messages|numbers|entries)", text)

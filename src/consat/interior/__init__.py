@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array
 
 from consat.estimates import Estimates
-from consat.interior.layout import Batch, Plan, Route, Shared, plan_of, route_of
 from consat.interior import step
+from consat.interior.layout import Batch, Plan, Route, Shared, plan_of, route_of
 from consat.interior.step import Gains, Lanes, Mail, Memory, Proof, Units
 from consat.numerics import pick, taken
 from consat.scale import Scale
@@ -145,5 +145,5 @@ def _out(memory: Memory) -> Memory:
 def _widened(leaf: Array, width: int) -> Array:
     """(g, p, …, A) → (g·A, width, …)."""
     leaf = jnp.moveaxis(leaf, -1, 1)
-    leaf = leaf.reshape(-1, *leaf.shape[2:])
+    leaf = leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
     return jnp.pad(leaf, [(0, 0), *[(0, width - size) for size in leaf.shape[1:]]])

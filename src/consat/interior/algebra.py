@@ -94,6 +94,9 @@ def reduced(matrix: Array, vector: Array, shared: Array) -> tuple[Array, Array, 
     """
     size, count = vector.shape
     g, p, _ = shared.shape
+    if not g * p:
+        none = jnp.zeros((g, count))
+        return jnp.zeros((g, p, p, count)), jnp.zeros((g, p, count)), none, none == 0.0
     shared = jnp.moveaxis(shared, 1, 0)  # (p, g, A)
     stays = (jnp.arange(size, dtype=shared.dtype)[:, None, None, None] == shared[None]).any(axis=1)  # (N, g, A)
     inner = jnp.where(stays[:, None] | stays[None], jnp.eye(size)[:, :, None, None], matrix[:, :, None])

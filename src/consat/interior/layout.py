@@ -7,7 +7,6 @@ to it through others, unless several variables go round a loop together; where a
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -170,7 +169,8 @@ def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
     order, parent = breadth_first_order(graph, count, directed=True)
     child = order[1:]
     child = child[parent[child] < count]
-    return np.sort(np.stack([child, parent[child]], axis=1), axis=1).astype(np.int32)
+    found = np.sort(np.stack([child, parent[child]], axis=1), axis=1).astype(np.int32)
+    return found[np.lexsort((found[:, 1], found[:, 0]))]
 
 
 WIDE = 40
@@ -182,7 +182,7 @@ def route_of(team: Team, layout: Literal["full", "local"]) -> tuple[Route, Estim
     along_links = Estimates.of(team, layout)
     if len(along_links.links) == team.count - 1 - int(along_links.cluster.max(initial=0)):
         return "tree", along_links
-    tree = dataclasses.replace(team, links=spanning_tree(team.count, along_links.links))
+    tree = team.with_links(spanning_tree(team.count, along_links.links))
     along_tree = Estimates.of(tree, layout)
     if int(Shared.of(along_tree).sizes(team.dimension).max(initial=0)) <= WIDE:
         return "tree", along_tree
@@ -232,16 +232,16 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
             place[flat[inside]] = offset + inside
             offset += flat.size
         where[name] = jnp.asarray(place)
-    floats = size * (size + 1) // 2 + size
+    places = size - np.bincount(shared.pair, weights=shared.row < 0, minlength=len(shared.pairs)).astype(np.int64)
+    # a quadratic with barrier, level and margin, and a proof with its constant, weight and error
+    floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
         jnp.asarray(floats), int(size.max(initial=0)),
     )  # fmt: skip
 
 
-def _made(
-    team: Team, copies: Estimates, shared: Shared, forms: list[Form], start: np.ndarray, slot: np.ndarray, group: _Group
-) -> Batch:
+def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], start: np.ndarray, slot: np.ndarray, group: _Group) -> Batch:
     agents, d = group.agents, team.dimension
     place = np.full(team.count, -1)
     place[agents] = np.arange(len(agents))

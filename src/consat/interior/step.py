@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.interior.algebra import gram, reduced, solve, spread, times
-from consat.interior.layout import Batch, Form, Kind
+from consat.interior.layout import Batch, Kind
 from consat.scale import Scale
 
 NUDGE = 1e-3
@@ -292,9 +292,7 @@ def number(mask: Array) -> Array:
     return jnp.sum(mask.astype(float), axis=0)
 
 
-def act(
-    lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, told: Array, gains: Gains
-) -> tuple[Memory, Mail]:
+def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, told: Array, gains: Gains) -> tuple[Memory, Mail]:
     """A Newton step on own constraints and the neighbours' quadratics, then a quadratic and a proof for each neighbour.
 
     Args:
@@ -390,9 +388,7 @@ def _least_of_others(numbers: Array) -> Array:
     return jnp.where(mine, second[None], least[None])
 
 
-def model(
-    here: Here, s: Array, multiplier: Array, barrier: Array, used: Array, warm: Array, gains: Gains
-) -> tuple[Array, Array]:
+def model(here: Here, s: Array, multiplier: Array, barrier: Array, used: Array, warm: Array, gains: Gains) -> tuple[Array, Array]:
     """(N, N, A) the matrix and (N, A) the gradient of Newton's step; where `warm`, (A,), of the mean of the margins, without a level."""
     count = s.shape[-1]
     some = used[:-1].any(axis=0)
@@ -438,9 +434,7 @@ SLACK = 3e-4
 """What that region may add to the bound at most, in units of ψ."""
 
 
-def prove(
-    lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multiplier: Array, inbox: Proof
-) -> tuple[Proof, Array]:
+def prove(lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multiplier: Array, inbox: Proof) -> tuple[Proof, Array]:
     """The proof for each neighbour, and (A,) a bound on the best margin: max_x Σ λψ / Σ λ over all agents (design, section 9).
 
     A ψ that is not quadratic stands in by its tangent, which is above it everywhere if it is concave. So that no direction is flat, every
@@ -468,7 +462,7 @@ def prove(
 
     places = jnp.where(shared < size, shared, size)  # the level is no variable of the proof
     outside, pull = spread(inbox.matrix, inbox.vector, places, size)
-    neighbour, have = shared[:, 0] <= size, inbox.weight > 0
+    neighbour, have = (shared <= size).any(axis=1), inbox.weight > 0
     missing = number(neighbour & ~have)
     total, forces = matrix + outside, vector + pull
     height = constant + curve * weight * reach**2 + jnp.sum(inbox.constant, axis=0)

@@ -32,6 +32,20 @@ def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
 
 
 __all__ = [
-    "FLOWS", "ROUNDS", "Admm", "Flow", "GradientFlow", "Known", "Links", "Local", "InteriorPoint", "ProportionalIntegral", "Proximal", "Rounds", "Selfish",
-    "Solver", "State", "with_gains",
+    "FLOWS",
+    "ROUNDS",
+    "Admm",
+    "Flow",
+    "GradientFlow",
+    "InteriorPoint",
+    "Known",
+    "Links",
+    "Local",
+    "ProportionalIntegral",
+    "Proximal",
+    "Rounds",
+    "Selfish",
+    "Solver",
+    "State",
+    "with_gains",
 ]  # fmt: skip

@@ -91,9 +91,7 @@ class Admm:
         level = solver.links.at(wish)
         return AdmmState(x, at_links, wish, level, level, solver.recall(x, wish))
 
-    def speak(
-        self, state: AdmmState, solver: Solver, round_: Array, known: Known
-    ) -> tuple[AdmmState, tuple[Array, Array, Array]]:
+    def speak(self, state: AdmmState, solver: Solver, round_: Array, known: Known) -> tuple[AdmmState, tuple[Array, Array, Array]]:
         links = solver.links
         x, u, wish = state.x, state.u, state.wish
         rho = jnp.sqrt(links.at(wish) * state.heard)

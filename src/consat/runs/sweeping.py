@@ -267,7 +267,9 @@ class _Asked:
             key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None
         }
         loss, sleep = combination.weather
-        world = world_of(ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks)
+        world = world_of(
+            ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks
+        )
         default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
         rules = Rules(
             end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,

@@ -148,7 +148,9 @@ def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Arr
     kept = Kept(*(jnp.expand_dims(leaf, 0) for leaf in chosen.of_seen(seen)))
     scalars = {name: getattr(seen, name)[None] for name in SCALARS}
     count = violated(world.observer, chosen.watched, now.body).astype(jnp.asarray(0).dtype)
-    return now, Chunk(jnp.asarray(1), **scalars, near=jnp.asarray(0), drift=jnp.max(jnp.abs(now.body), initial=0.0), violated=count, kept=kept)
+    return now, Chunk(
+        jnp.asarray(1), **scalars, near=jnp.asarray(0), drift=jnp.max(jnp.abs(now.body), initial=0.0), violated=count, kept=kept
+    )
 
 
 class Ask(NamedTuple):

@@ -323,8 +323,8 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, Array]:
 
 
 SATISFIED, INFEASIBLE, NEAR, BEST = 1, 2, 4, 8
-"""What all agents know, as bits: that all are satisfied; that the team cannot be satisfied (or that it is); and that its margin is proven to
-be near the best, or the best to `EXACTLY`."""
+"""What all agents know, as bits: that all are satisfied; that the team cannot be satisfied; and that its margin is proven to be near the
+best, or the best to `EXACTLY`."""
 NEARLY, EXACTLY = 0.05, 1e-3
 """Near is within this part of the bound, or within `EXACTLY` in units of ψ; both of what the agents know."""
 
@@ -404,7 +404,15 @@ def precision_for(count: int) -> prox.Precision:
 
 
 def world_of(
-    team: Team, copies: Estimates, nu: Nu, size: Scale, *, convex: bool, weather: Weather, body: Body | None, speaks: str = "link",
+    team: Team,
+    copies: Estimates,
+    nu: Nu,
+    size: Scale,
+    *,
+    convex: bool,
+    weather: Weather,
+    body: Body | None,
+    speaks: str = "link",
     partial: bool = False,
 ) -> World:
     """Everything that does not change; arguments as in `consat.simulate.rounds.simulate_rounds`; speaks: see `consat.protocols.Rounds`;

@@ -136,6 +136,12 @@ class Team:
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
 
+    def with_links(self, links: np.ndarray) -> Team:
+        """The same agents and constraints with other links, (L, 2), sorted."""
+        team = copy.copy(self)
+        team.links = links
+        return team
+
     def part(self, agents: np.ndarray) -> tuple[Team, np.ndarray]:
         """The team of some of the agents, given by their places in ascending order, with the constraints and links that only involve them;
         and the (M',) places that its constraints have in this one."""
