@@ -20,7 +20,7 @@ from consat.numerics import pick, taken
 from consat.scale import Scale
 from consat.teams.team import Team
 
-__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Units", "route_of"]
+__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "Units", "route_of"]
 
 
 @jax.tree_util.register_dataclass
@@ -35,6 +35,7 @@ class Interior:
         other: (P,) the other end of the same link; of one agent alone, whose links end elsewhere, nothing.
         owner: (M,) whose constraint each is, family after family.
         degree: (N,) how many neighbours each has.
+        level: (P,) whether the level travels over the pair, and with it the least margin.
     """
 
     plan: Plan
@@ -43,6 +44,7 @@ class Interior:
     other: Array
     owner: Array
     degree: Array
+    level: Array
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, size: Scale) -> Interior:
@@ -58,13 +60,23 @@ class Interior:
             jnp.asarray(np.searchsorted(keys, listener * team.count + talker).astype(np.int32)),
             jnp.asarray(owner),
             jnp.asarray(np.bincount(talker, minlength=team.count)),
+            jnp.asarray(shared.level),
         )
+
+    @classmethod
+    def alone(cls, team: Team, copies: Estimates, shared: Shared, units: Units) -> Interior:
+        """Of one agent, a team of one, whose links end elsewhere."""
+        pairs, constraints = len(shared.pairs), sum(family.size for family in team.families)
+        talker, nothing = np.zeros(pairs, dtype=np.int32), np.zeros(0, dtype=np.int32)
+        owner = np.zeros(constraints, dtype=np.int32)
+        arrays = (jnp.asarray(each) for each in (talker, nothing, owner, np.array([pairs]), shared.level))
+        return cls(plan_of(team, copies, shared), units, *arrays)
 
     def silence(self) -> Mail:
         """The mail before anything was said; leading axis P."""
         p, pairs = self.plan.width, len(self.talker)
         matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
-        return Mail(matrix, vector, number - 1.0, number, number + jnp.inf, Proof(matrix, vector, number, number, number))
+        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, Proof(matrix, vector, number, number, number))
 
     def across(self, mail: Mail) -> Mail:
         """What stands at the other ends."""
@@ -88,7 +100,7 @@ class Interior:
             margin: (N,) ᾱ_i where the bodies are.
             gains: of the protocol.
         """
-        units, pairs = self.units, len(self.talker)
+        units, pairs, inbox = self.units, len(self.talker), self._counted(inbox)
         y, told = _normal(memory.y, units), margin / units.psi
 
         def turn(batch: Batch) -> tuple[Memory, Mail]:
@@ -114,8 +126,12 @@ class Interior:
 
     def least(self, inbox: Mail, margin: Array) -> Array:
         """(N,) the least margin of the team that each agent knows of, given its own, (N,)."""
-        heard = jax.ops.segment_min(inbox.margin * self.units.psi, self.talker, len(margin), indices_are_sorted=True)
-        return jnp.minimum(margin, heard)
+        told = self._counted(inbox).margin * self.units.psi
+        return jnp.minimum(margin, jax.ops.segment_min(told, self.talker, len(margin), indices_are_sorted=True))
+
+    def _counted(self, inbox: Mail) -> Mail:
+        """With the margins that came along the spanning tree alone: on a loop an old one would go round for ever."""
+        return inbox._replace(margin=jnp.where(self.level, inbox.margin, jnp.inf))
 
     def _collected(self, found: list[Memory]) -> Memory:
         """The answers of all batches, each where it belongs."""

@@ -142,6 +142,13 @@ class Shared:
         order = np.lexsort((position, pair))
         return cls(np.stack(np.divmod(pairs, max(count, 1)), axis=1).astype(np.int32), pair[order], row[order])
 
+    @property
+    def level(self) -> np.ndarray:
+        """(P,) which pairs share the level."""
+        found = np.zeros(len(self.pairs), dtype=bool)
+        found[self.pair[self.row < 0]] = True
+        return found
+
     def sizes(self, dimension: int) -> np.ndarray:
         """(P,) how many numbers the shared variables of each pair are."""
         width = np.where(self.row < 0, 1, dimension)

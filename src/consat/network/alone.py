@@ -10,6 +10,8 @@ import numpy as np
 from jax import Array
 
 from consat import prox
+from consat.estimates import Estimates
+from consat.interior import Interior, Shared, Units
 from consat.network.part import Part
 from consat.numerics import Groups
 from consat.objective import Nu, Objective
@@ -74,18 +76,17 @@ class Alone(LocalSolver):
     me: int = field(metadata={"static": True})
 
     @classmethod
-    def of(cls, part: Part) -> Alone:
-        """The solver of a part; its rows are in the order of `part.team.ids`, and it is agent 0 of one."""
+    def of(cls, part: Part, speaks: str = "link") -> Alone:
+        """The solver of a part; its rows are in the order of `part.team.ids`, and it is agent 0 of one. Speaks: see
+        `consat.protocols.Rounds`."""
         team = part.team
         me = team.ids.index(part.me)
-        plan = prox.buckets(team, lambda _, position: position, team.count, part.convex)
-        batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
         return cls(
             links=OwnLinks.of(part),
             length=jnp.asarray(part.length),
             region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
-            interior=None,
-            plan=prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1),
+            interior=_interior(part) if speaks == "pair" else None,
+            plan=_plan(part, me) if speaks == "link" else None,
             nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
             local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
             holder=jnp.zeros(team.count, dtype=np.int32),
@@ -96,6 +97,28 @@ class Alone(LocalSolver):
             precision=EXACT,
             me=me,
         )
+
+
+def _plan(part: Part, me: int) -> prox.Plan:
+    plan = prox.buckets(part.team, lambda _, position: position, part.team.count, part.convex)
+    batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
+    return prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1)
+
+
+def _interior(part: Part) -> Interior:
+    """Of the agent as a team of one, whose constraints read its copies; its pairs are in the order of `part.neighbours`."""
+    team, none = part.team, np.zeros((0, 2), dtype=np.int32)
+    number = np.arange(team.count, dtype=np.int32)
+    rows = [[*map(team.ids.index, neighbour.travels), *[-1] * neighbour.level] for neighbour in part.neighbours]
+    pair = np.repeat(np.arange(len(rows)), [len(shares) for shares in rows])
+    talks = np.stack([np.zeros(len(rows), dtype=np.int32), np.arange(len(rows), dtype=np.int32)], axis=1)
+    me = np.array([team.ids.index(part.me)], dtype=np.int32)
+    families = [replace(family, owner=np.zeros_like(family.owner)) for family in team.families]
+    one = team.with_constraints(families, np.zeros_like(team.owner), team.names)
+    one.ids = (part.me,)
+    copies = Estimates("local", np.zeros_like(number), number, me, none, np.zeros(1, dtype=np.int32), none)
+    units = Units(*(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length)))
+    return Interior.alone(one, copies, Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int)), units)
 
 
 def ends(part: Part) -> list[tuple[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -12,6 +12,11 @@ from consat.network.gather import Observer, Seen
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+_KNOWN: Final = {
+    "satisfied": ", all know that all are satisfied",
+    "infeasible": ", all know that not all can be satisfied",
+}
 
 
 @contextmanager
@@ -36,7 +41,7 @@ def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: 
 
     margins = [seen.report["margin"] for seen in observer.seen.values() if seen.report and seen.report["margin"] is not None]
     worst = f", margin {min(margins):+.4g}" if margins else ""
-    known = ", all know that all are satisfied" if observer.all_known() is not None else ""
+    known = _KNOWN.get(observer.all_known()[0] or "", "")
     drawn = Table(title=f"{title}: {seconds:.1f} s{worst}{known}", title_justify="left")
     for column in ("agent", "state", "margin", "turns/s", "loss", "round trip", "deaf to"):
         drawn.add_column(column, justify="left" if column in ("agent", "state", "deaf to") else "right")
@@ -63,7 +68,7 @@ def _state(seen: Seen, *, up: bool) -> str:
         return "ended" if seen.ended is not None else "down"
     if seen.report is None:
         return "starting"
-    return "satisfied" if seen.known is not None else "running" if seen.stamps else "waiting"
+    return seen.known or ("running" if seen.stamps else "waiting")
 
 
 def _rate(seen: Seen) -> float:

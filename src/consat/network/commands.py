@@ -26,11 +26,15 @@ from consat.terminal import (
 if TYPE_CHECKING:
     from consat.network.part import Part
 
-MODES = ["lockstep", "link", "admm"]
+MODES = ["interior-point", "admm", "link", "lockstep"]
 
-protocol_option = click.option("--protocol", metavar="KIND", help="For --mode lockstep: admm (default), proximal, max-min.")
+protocol_option = click.option(
+    "--protocol", metavar="KIND", help="For --mode lockstep: interior-point (default), max-min, admm, proximal; else as the mode is called."
+)
 port_option = click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Of the first agent.")
-mode_option = click.option("--mode", type=click.Choice(MODES), default="admm", show_default=True, help="How they talk.")
+mode_option = click.option(
+    "--mode", type=click.Choice(MODES), help="How they talk; admm if that is the protocol of the scenario, else interior-point."
+)
 rate_option = click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Turns a second.")
 speed_option = click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s.")
 pace_option = click.option(
@@ -159,12 +163,14 @@ def agent(
     FILE is its private file (consat split), or a scenario, of which it takes its own part. Events are JSON lines on stdout.
     """
     prepare_own(exact=mode == "lockstep")
-    from consat.network.modes import Manner
+    from consat.network.modes import Manner, mode_for
     from consat.network.process import Circumstances, run_agent
 
     speed = around.pop("speed")
-    part = _part(scenario, agent, overrides, port)
-    manner = Manner(mode, rate, pace, rounds, memory, math.inf if give_up is None else give_up, report)
+    part = _part(scenario, agent, overrides, port, mode)
+    manner = Manner(
+        mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report
+    )
     position = around["position"]
     if position is not None and len(position) != part.team.dimension:
         raise click.UsageError(f"--position has {counted(len(position), 'number')}, but must have {part.team.dimension}")
@@ -188,7 +194,7 @@ def agent(
 @delay_option
 @rounds_option
 @until_option
-@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; after convergence if nothing is said.")
+@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; by itself if nothing is said.")
 @keys_option
 @out_option
 @force_option
@@ -206,11 +212,15 @@ def launch(
     prepare_own(exact=False)
     from consat.network.launch import Plan
     from consat.network.launch import launch as launch_team
+    from consat.network.modes import mode_for
     from consat.result import RESULT
+    from consat.runs.preparation import default_protocol
     from consat.scenario import load
     from consat.simulate.files import claim
 
     loaded = _with(load(scenario, overrides), protocol, estimates, seed)
+    asked = loaded.settings.protocol
+    plan["mode"] = plan["mode"] or mode_for(asked.kind or default_protocol(loaded.team, asked.estimates))
     if out is not None:
         claim(out, loaded.name, force=force)
     with located(loaded):
@@ -237,9 +247,10 @@ def _with(scenario: Any, protocol: str | None, estimates: str | None, seed: int 
     return dataclasses.replace(scenario, settings=settings)
 
 
-def _part(file: str, agent: str, overrides: tuple[str, ...], port: int) -> Part:
-    """The agent's own part, of a private file or of a scenario."""
+def _part(file: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any) -> Part:
+    """The agent's own part, of a private file or of a scenario, which is split as suits the mode."""
     from consat.errors import InvalidSettings, closest
+    from consat.network.modes import protocol_of
     from consat.network.part import is_part, load_text, read_part, split
     from consat.scenario import load
 
@@ -254,6 +265,8 @@ def _part(file: str, agent: str, overrides: tuple[str, ...], port: int) -> Part:
     loaded = load(file, overrides)
     if agent not in loaded.team.ids:
         raise InvalidSettings(f"there is no agent {agent!r}{closest(agent, loaded.team.ids)}")
+    if mode is not None:
+        loaded = _with(loaded, protocol_of(mode, loaded.settings.protocol.kind), None, None)
     with located(loaded):
         return split(loaded, port=port, only=agent)[agent]
 

@@ -1,7 +1,7 @@
 """What an agent computes, apart from how its messages travel: a protocol, compiled for its own part, and what it knows of bodies.
 
-A core turns what has come since its last turn into its next state and what it says next: one row of numbers for each end of a link.
-`Embodied` adds to any core the agreement about bodies.
+A core turns what has come since its last turn into its next state and what it says next: one row of numbers for each end of a link, and one
+for each neighbour. `Embodied` adds to any core the agreement about bodies.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from jax import Array
 
 from consat.network.alone import Alone, ends
 from consat.network.part import Part
+from consat.network.wire import Numbers
 from consat.numerics import quick_compilation
-from consat.protocols import Rounds, agreement
+from consat.protocols import Known, Rounds, agreement
+from consat.protocols.interior_point import near
 from consat.prox import Memory
 
 LARGEST: Final = 1e100
@@ -38,6 +40,7 @@ class Moment(NamedTuple):
         delay: (E,) how long messages take over each end, s.
         fresh: (E,) whether the neighbour at the other end was heard lately.
         body: (d,) where the agent's body is, NaN where that is not known.
+        margin: ᾱ_i there, and where it last heard that the others are; −∞ where that is not known.
     """
 
     round: float
@@ -45,6 +48,7 @@ class Moment(NamedTuple):
     delay: np.ndarray
     fresh: np.ndarray
     body: np.ndarray
+    margin: float = -np.inf
 
 
 class Look(NamedTuple):
@@ -55,12 +59,48 @@ class Look(NamedTuple):
         bodies: (rows, d) where its own body is, and where it last heard that the others are.
         heard: whether it has heard of all of them.
         known: for how many turns it has known that all are satisfied, by their bodies.
+        bound: proven to be at least the best margin that the team can have; +∞ without proof.
+        least: the least margin of the team's bodies that it knows of; −∞ while it has not heard of all.
+        near: whether that is proven to be near the best.
     """
 
     x: np.ndarray
     bodies: np.ndarray
     heard: bool
     known: float
+    bound: float = np.inf
+    least: float = -np.inf
+    near: bool = False
+
+
+class Rows(NamedTuple):
+    """What an agent says or hears in a turn.
+
+    Attributes:
+        link: (E, width) for each end of a link.
+        pair: (G, W) for each neighbour that is there, in the order of the part, padded to the longest.
+    """
+
+    link: np.ndarray
+    pair: np.ndarray
+
+
+class Turned(NamedTuple):
+    """What comes of a turn of a protocol.
+
+    Attributes:
+        state: the next.
+        said: what to say.
+        x: (rows, d) the estimates.
+        bound: see `Look`.
+        least: see `Look`.
+    """
+
+    state: Any
+    said: Rows
+    x: np.ndarray
+    bound: float = np.inf
+    least: float = -np.inf
 
 
 class Core(Protocol):
@@ -87,6 +127,11 @@ class Core(Protocol):
         ...
 
     @property
+    def letters(self) -> Mapping[str, Numbers]:
+        """What it says to each neighbour besides, whoever is there."""
+        ...
+
+    @property
     def solver(self) -> Alone:
         """Of the part."""
         ...
@@ -95,9 +140,8 @@ class Core(Protocol):
         """The state from first estimates, (rows, d)."""
         ...
 
-    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, np.ndarray]:
-        """Hear what arrived, (E, width), where `arrived`, (E,); take a step; the next state, what to say, (E, width), and the
-        estimates, (rows, d)."""
+    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+        """Hear what arrived, where `arrived`, (E,) and (G,), and take a step."""
         ...
 
     def among(self, gone: Collection[str]) -> Core:
@@ -139,6 +183,11 @@ def _take(index: np.ndarray, old: Array, fresh: Array) -> Array:
     return jnp.where(kept, jnp.asarray(old)[np.maximum(index, 0)], fresh)
 
 
+def no_letters(whole: Part) -> Mapping[str, Numbers]:
+    """Of a protocol that speaks for each end of a link only."""
+    return {neighbour.id: Numbers((0,)) for neighbour in whole.neighbours}
+
+
 class _Now(NamedTuple):
     state: Any
     ages: agreement.Ages
@@ -159,13 +208,15 @@ class RoundCore:
         # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
         single = PENALTY / whole.length**2 if protocol.name == "admm" else np.inf
         self.largest = np.array([*(LARGEST if shape else single for shape, size in self._layout.each for _ in range(size)), LARGEST])
+        self.letters = no_letters(whole)
 
     def begin(self, first: np.ndarray) -> _Now:
         return self._begin(self.protocol, self.solver, first)
 
-    def turn(self, state: _Now, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[_Now, np.ndarray, np.ndarray]:
-        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, (inbox, arrived, moment.fresh), moment.round)
-        return now, np.asarray(outbox), np.asarray(now.state.x)
+    def turn(self, state: _Now, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+        heard = inbox.link, arrived.link, moment.fresh
+        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, heard, (moment.round, moment.margin))
+        return Turned(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
 
     def among(self, gone: Collection[str]) -> RoundCore:
         return RoundCore(self.protocol, self.whole, gone)
@@ -207,7 +258,7 @@ class _Layout(NamedTuple):
         first, outline = jax.ShapeDtypeStruct((len(solver.holder), dimension), float), _Outline(solver)
 
         def message(x: Array) -> Any:
-            return protocol.speak(protocol.start(x, outline), outline, jnp.asarray(0.0), jnp.zeros(1))[1]
+            return protocol.speak(protocol.start(x, outline), outline, jnp.asarray(0.0), Known(jnp.zeros(1), jnp.zeros(1)))[1]
 
         leaves, structure = jax.tree.flatten(jax.eval_shape(message, first))
         return cls(structure, tuple(leaf.shape[1:] for leaf in leaves))
@@ -236,12 +287,14 @@ def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
 
 
 def _turn(
-    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], round_: Array
+    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], moment: tuple[Array, Array]
 ) -> tuple[_Now, Array]:
     inbox, arrived, fresh = heard
+    round_, margin = moment
     state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
     ages = known_of(agreement.hear(now.ages, inbox[:, -1], arrived), fresh)
-    state, message = protocol.speak(state, solver, round_, agreement.known(ages, solver))
+    known = Known(agreement.known(ages, solver), jnp.asarray(margin)[None])
+    state, message = protocol.speak(state, solver, round_, known)
     ages, told = agreement.speak(ages, state.x, solver)
     outbox = jnp.concatenate(
         [*(leaf.reshape(len(inbox), size) for leaf, size in zip(jax.tree.leaves(message), layout.sizes, strict=True)), told[:, None]],
@@ -283,20 +336,33 @@ class Embodied:
         dimension = self.part.team.dimension
         self.width = core.width + dimension + 2
         self.largest = np.append(core.largest, np.full(dimension + 2, LARGEST))
+        self.letters = core.letters
         self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
 
     def begin(self, first: np.ndarray) -> EmbodiedState:
         """The state from first estimates, (rows, d)."""
         return EmbodiedState(self.core.begin(first), self._start(self.core.solver, first))
 
-    def turn(self, state: EmbodiedState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[EmbodiedState, np.ndarray, Look]:
+    def turn(self, state: EmbodiedState, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[EmbodiedState, Rows, Look]:
         """See `Core.turn`; and what the agent then sees of itself."""
-        inner, outbox, x = self.core.turn(state.core, inbox[:, : self.core.width], arrived, moment)
-        bodies, said, heard, known = self._agree(
-            self.core.solver, self._owners, state.bodies, (inbox[:, self.core.width :], arrived, moment.fresh), moment.body
+        width = self.core.width
+        bodies, said, sight = self._agree(
+            self.core.solver, self._owners, state.bodies, (inbox.link[:, width:], arrived.link, moment.fresh), moment.body
         )
-        look = Look(x, np.asarray(bodies.position), bool(np.asarray(heard)[0]), float(np.asarray(known)[0]))
-        return EmbodiedState(inner, bodies), np.concatenate([outbox, np.asarray(said)], axis=1), look
+        heard, known, margin = (np.asarray(each)[0] for each in sight)
+        moment = moment._replace(margin=float(margin))
+        inner = self.core.turn(state.core, Rows(inbox.link[:, :width], inbox.pair), arrived, moment)
+        proven = near(inner.bound, inner.least, self.part.psi)
+        look = Look(inner.x, np.asarray(bodies.position), bool(heard), float(known), inner.bound, inner.least, proven)
+        link = np.concatenate([inner.said.link, np.asarray(said)], axis=1)
+        return EmbodiedState(inner.state, bodies), Rows(link, inner.said.pair), look
+
+    def empty(self) -> tuple[Rows, Rows]:
+        """Nothing has come: an inbox, and what in it has arrived."""
+        neighbours = [neighbour.id for neighbour in self.part.neighbours]
+        longest = max((self.letters[neighbour].shape[0] for neighbour in neighbours), default=0)
+        inbox = Rows(np.zeros((len(self.ends), self.width)), np.zeros((len(neighbours), longest)))
+        return inbox, Rows(*(np.zeros(len(rows), dtype=bool) for rows in inbox))
 
     def margin(self, positions: np.ndarray) -> float:
         """ᾱ_i, were the agents of the part at these positions, (rows, d); +∞ without constraints."""
@@ -323,12 +389,14 @@ def owners_of(part: Part) -> agreement.Owners:
 
 def _agree(
     solver: Alone, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array
-) -> tuple[agreement.Bodies, Array, Array, Array]:
+) -> tuple[agreement.Bodies, Array, tuple[Array, Array, Array]]:
     inbox, arrived, fresh = heard
     bodies = agreement.hear_bodies(bodies, agreement.Word(inbox[:, :-2], inbox[:, -2], inbox[:, -1]), arrived, owners, solver)
     bodies, word = agreement.speak_bodies(bodies._replace(ages=known_of(bodies.ages, fresh)), body[None], owners, solver)
     said = jnp.concatenate([word.position, word.stale[:, None], word.age[:, None]], axis=1)
-    return bodies, said, agreement.all_heard(bodies, solver), agreement.known(bodies.ages, solver)
+    all_heard = agreement.all_heard(bodies, solver)
+    margin = jnp.where(all_heard & jnp.isfinite(body).all(), solver.margin(bodies.position), -jnp.inf)
+    return bodies, said, (all_heard, agreement.known(bodies.ages, solver), margin)
 
 
 class _Programs(NamedTuple):

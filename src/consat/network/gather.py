@@ -13,6 +13,7 @@ import numpy as np
 
 from consat.estimates import Estimates
 from consat.network.fleet import Event
+from consat.network.station import Knowledge
 from consat.objective import Nu, Objective
 from consat.simulate.violations import shares_of
 from consat.teams.team import Team
@@ -30,7 +31,9 @@ class Seen:
         stamps: rounds or times.
         places: (d,) where its body was at each.
         report: the last one.
-        known: since which stamp it knows that all are satisfied, or None.
+        known: what it knows of the team, see `consat.network.station.Knowledge`.
+        known_from: since which stamp, or None.
+        settled_from: since which stamp it knows all that there is to find, or None; see `consat.network.station.Station.settled`.
         finished: whether its last round is over.
         born: when its process was ready, by its clock.
         ended: its last event, if it came.
@@ -39,7 +42,9 @@ class Seen:
     stamps: list[float] = field(default_factory=list)
     places: list[list[float]] = field(default_factory=list)
     report: Event | None = None
-    known: float | None = None
+    known: Knowledge = None
+    known_from: float | None = None
+    settled_from: float | None = None
     finished: bool = False
     born: float | None = None
     ended: Event | None = None
@@ -51,7 +56,8 @@ class Seen:
         match event["event"]:
             case "start":
                 self._before, self._sent, self.ended = self._before + self._sent, Counter(), None
-                self.known, self.born = None, event["t"]
+                self._learn(None, None, settled=False)
+                self.born = event["t"]
             case "report":
                 self.report = event
                 self._sent = Counter(event["sent"])
@@ -59,15 +65,22 @@ class Seen:
                     self.stamps.append(stamp)
                     self.places.append(place)
             case "satisfied":
-                self.known = event["stamp"]
-            case "unsatisfied":
-                self.known = None
+                self._learn("satisfied", event["stamp"], settled=True)
+            case "infeasible":
+                self._learn("infeasible", event["stamp"], settled=event["near"])
+            case "unsatisfied" | "undecided":
+                self._learn(None, None, settled=False)
             case "finished":
                 self.finished = True
             case "end":
                 self.ended = event
             case _:
                 return
+
+    def _learn(self, known: Knowledge, stamp: float | None, *, settled: bool) -> None:
+        if known != self.known:
+            self.known, self.known_from = known, stamp
+        self.settled_from = stamp if settled else None
 
     @property
     def sent(self) -> Counter[str]:
@@ -103,10 +116,18 @@ class Observer:
             if event.get("id") in self.seen:
                 self.seen[event["id"]].take(event)
 
-    def all_known(self) -> float | None:
-        """Since which stamp all know that all are satisfied, or None."""
+    def all_known(self) -> tuple[Knowledge, float | None]:
+        """What all agents know, and since which stamp. Where some know that all that they can hear of are satisfied, and others that the
+        team cannot be, it is infeasible."""
         known = [seen.known for seen in self.seen.values()]
-        return None if any(stamp is None for stamp in known) else max(float(stamp) for stamp in known if stamp is not None)
+        if None in known:
+            return None, None
+        return "infeasible" if "infeasible" in known else "satisfied", max(seen.known_from or 0.0 for seen in self.seen.values())
+
+    def concluded(self) -> float | None:
+        """Since which stamp all know all that there is to find, or None."""
+        since = [seen.settled_from for seen in self.seen.values()]
+        return None if None in since else max(stamp for stamp in since if stamp is not None)
 
     def settled(self, window: float, distance: float) -> bool:
         """Whether nobody has moved by more than `distance` over the last `window` of stamps, and all are up and heard."""
@@ -128,7 +149,7 @@ class Observer:
             agents[agent] = {
                 "sent": dict(seen.sent), "dropped": report.get("dropped", {}), "cpu": None if seen.ended is None else seen.ended.get("cpu"),
             }  # fmt: skip
-        known = self.all_known()
+        _, known = self.all_known()
         trips = [link["trip"] for link in links if link["trip"] is not None]
         return {
             "loss": float(np.mean([link["loss"] for link in links])) if links else None,
@@ -150,7 +171,7 @@ class Observer:
         dt = 1.0 if self.clock == "round" else SAMPLE
         margins, smooth = map(np.asarray, _look(Objective.at_positions(self.team), jnp.asarray(position), nu))
         sent = sum((seen.sent for seen in self.seen.values()), Counter[str]())
-        known = self.all_known()
+        known, known_from = self.all_known()
         return Trace(
             clock="round" if self.clock == "round" else "time",
             steps=steps if self.clock == "time" else steps.astype(int),
@@ -168,8 +189,8 @@ class Observer:
             satisfied_from=satisfied_from(steps, margins.min(axis=1), interpolate=False),
             messages=sent["messages"],
             floats_sent=sent["floats"],
-            known="satisfied" if known is not None else None,
-            known_from=int(known) if known is not None and self.clock == "round" else None,
+            known=known,
+            known_from=int(known_from) if known_from is not None and self.clock == "round" else None,
             seconds=seconds,
             violated=shares_of(self.team, position),
         )

@@ -7,12 +7,13 @@ whose state leads nowhere, whatever it listens to, begins anew.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from consat.network.core import Embodied, Look, Moment
+from consat.network.core import Embodied, Look, Moment, Rows
 
 
 class Turn(NamedTuple):
@@ -20,39 +21,50 @@ class Turn(NamedTuple):
 
     Attributes:
         state: next.
-        outbox: (E, width) what to say.
+        outbox: what to say.
         look: what the agent sees of itself.
         refused: the neighbours whose messages were left out.
         anew: whether the state was given up.
     """
 
     state: Any
-    outbox: np.ndarray
+    outbox: Rows
     look: Look
     refused: tuple[str, ...] = ()
     anew: bool = False
 
 
-def turn(core: Embodied, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> Turn:
+def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turn:
     """Take a turn, see `Embodied.turn`, without those neighbours whose messages spoil it."""
     whole = Turn(*core.turn(state, inbox, arrived, moment))
     if _sound(state, whole):
         return whole
-    kept, refused = np.zeros_like(arrived), []
-    for neighbour in dict.fromkeys(neighbour for neighbour, _ in core.ends):
-        its = arrived & np.array([other == neighbour for other, _ in core.ends])
-        if not its.any():
+    kept, refused = set[str](), []
+    for neighbour in (each.id for each in core.part.neighbours):
+        its = _of(core, arrived, {neighbour})
+        if not (its.link.any() or its.pair.any()):
             continue
-        if _sound(state, Turn(*core.turn(state, np.where((kept | its)[:, None], inbox, 0.0), kept | its, moment))):
-            kept = kept | its
+        if _sound(state, Turn(*core.turn(state, *_only(core, inbox, arrived, kept | {neighbour}), moment))):
+            kept.add(neighbour)
         else:
             refused.append(neighbour)
-    heard = np.where(kept[:, None], inbox, 0.0), kept
-    rest = Turn(*core.turn(state, *heard, moment), refused=tuple(refused))
+    rest = Turn(*core.turn(state, *_only(core, inbox, arrived, kept), moment), refused=tuple(refused))
     if _sound(state, rest):
         return rest
     fresh = core.begin(core.part.first)
-    return Turn(*core.turn(fresh, np.zeros_like(inbox), np.zeros_like(arrived), moment), refused=tuple(refused), anew=True)
+    return Turn(*core.turn(fresh, *_only(core, inbox, arrived, set()), moment), refused=tuple(refused), anew=True)
+
+
+def _of(core: Embodied, arrived: Rows, neighbours: Collection[str]) -> Rows:
+    """What arrived from some neighbours."""
+    link = np.array([other in neighbours for other, _ in core.ends], dtype=bool)
+    return Rows(arrived.link & link, arrived.pair & np.array([each.id in neighbours for each in core.part.neighbours], dtype=bool))
+
+
+def _only(core: Embodied, inbox: Rows, arrived: Rows, neighbours: Collection[str]) -> tuple[Rows, Rows]:
+    """What came, and from whom, as if others than these neighbours had said nothing."""
+    kept = _of(core, arrived, neighbours)
+    return Rows(*(np.where(there[:, None], numbers, 0.0) for numbers, there in zip(inbox, kept, strict=True))), kept
 
 
 def _sound(before: Any, after: Turn) -> bool:

@@ -12,17 +12,17 @@ from typing import Final, Literal
 import numpy as np
 
 from consat.errors import NetworkError
-from consat.estimates import Estimates
 from consat.network.alone import Alone
 from consat.network.board import board
 from consat.network.fleet import Fleet, free_ports
 from consat.network.gather import Observer
-from consat.network.modes import RATE, Manner, Mode, protocol_of
+from consat.network.modes import DEFAULT_MODE, RATE, Manner, Mode, protocol_of
 from consat.network.part import Part, split
 from consat.numerics import float64
 from consat.objective import Schedule
 from consat.protocols import ROUNDS
 from consat.result import Result
+from consat.runs.preparation import copies_of
 from consat.runs.summary import summarise
 from consat.scale import automatic, scale
 from consat.scenario import Scenario
@@ -55,11 +55,12 @@ class Plan:
         delay: (low, high) for which each is held back there, s.
         rounds: how many turns; None for no end.
         until: how long, s; None for no end.
-        stop: when to end earlier; after convergence unless `rounds` or `until` say when.
+        stop: when to end earlier; unless `rounds` or `until` say when, once all agents know all that there is to find (interior-point), or
+            after convergence.
         keys: folder of the team's keys, see ``consat keys``; None for links without protection.
     """
 
-    mode: Mode = "admm"
+    mode: Mode = DEFAULT_MODE
     rate: float | None = None
     pace: float = 1.0
     speed: float | None = None
@@ -76,7 +77,9 @@ class Plan:
     @property
     def ending(self) -> Stop:
         """When to end."""
-        return self.stop or ("converged" if self.rounds is None and self.until is None else "never")
+        if self.rounds is not None or self.until is not None:
+            return self.stop or "never"
+        return self.stop or ("satisfied" if self.mode == "interior-point" else "converged")
 
     def options(self) -> list[str]:
         """Of ``consat agent``."""
@@ -123,7 +126,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    trace = observer.trace(Estimates.of(team, settings.protocol.estimates), schedule.final, ending, seconds)
+    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds)
     summary = summarise(scenario, settings, schedule, size, trace, full) | {"mode": plan.mode, "network": observer.network()}
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
@@ -145,7 +148,8 @@ class _Rules:
 def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
     if plan.mode == "lockstep":
         part = next(iter(parts.values()))
-        earliest = ROUNDS[part.settings.protocol.kind or "admm"]().earliest(Alone.of(part))
+        protocol = ROUNDS[protocol_of(plan.mode, part.settings.protocol.kind)]()
+        earliest = protocol.earliest(Alone.of(part, protocol.speaks))
         return _Rules(HOLD, SETTLED * length, earliest + HOLD)
     window = max(WINDOW, LINK_WINDOW / plan.pace if plan.mode == "link" else 0.0, HOLD / (plan.rate or RATE[plan.mode]))
     return _Rules(window + ROUND_TRIPS * plan.delay[1], SETTLED * length, -np.inf)
@@ -214,9 +218,9 @@ def _up(observer: Observer, began: float) -> float:
 
 def _ending(observer: Observer, stop: Stop, rules: _Rules) -> Ending | None:
     latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in observer.seen.values())
-    known = observer.all_known()
-    if stop == "satisfied" and known is not None and latest - known >= rules.window:
-        return "satisfied"
+    known, since = observer.all_known()[0], observer.concluded()
+    if stop != "never" and (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
+        return "satisfied" if known == "satisfied" else "settled"
     if stop != "never" and latest >= rules.earliest and observer.settled(rules.window, rules.distance):
         return "settled"
     return None

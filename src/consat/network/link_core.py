@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.alone import Alone, ends
-from consat.network.core import LARGEST, Core, Kept, Moment
+from consat.network.core import LARGEST, Core, Kept, Moment, Rows, Turned, no_letters
 from consat.network.part import Part
 from consat.numerics import quick_compilation
 from consat.prox import Memory
@@ -81,15 +81,16 @@ class LinkCore:
         self.solver = Alone.of(self.part)
         self.width = 2 * self.part.team.dimension + 1
         self.largest = np.full(self.width, LARGEST)
+        self.letters = no_letters(whole)
         self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray) -> LinkState:
         return self._begin(self.solver, first)
 
-    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, np.ndarray]:
+    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
-        state, outbox = self._turn(self.solver, gains, state, inbox, arrived, moment)
-        return state, np.asarray(outbox), np.asarray(state.x)
+        state, outbox = self._turn(self.solver, gains, state, inbox.link, arrived.link, moment)
+        return Turned(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
 
     def among(self, gone: Collection[str]) -> LinkCore:
         return LinkCore(self.whole, self.k1, self.k2, gone)

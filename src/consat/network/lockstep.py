@@ -8,13 +8,14 @@ memory starts anew in the round of the slowest neighbour, which a protocol that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import jax
 import numpy as np
 
-from consat.network.core import Moment
+from consat.network.core import Moment, Rows
 from consat.network.paced import FAREWELLS
 from consat.network.persistence import Store
 from consat.network.station import SILENT, Station
@@ -44,7 +45,7 @@ class Lockstep:
         self._round = 0  # so many are spoken
         self._regrouped = 0  # so many were, when somebody last came or went: a protocol begins anew then
         self._said: dict[str, list[np.ndarray]] = {}
-        self._blocks: dict[str, dict[int, np.ndarray]] = {neighbour: {} for neighbour in station.peers.all}
+        self._blocks: dict[str, dict[int, Sequence[np.ndarray]]] = {neighbour: {} for neighbour in station.peers.all}
         self._rumours: dict[str, tuple[int, int]] = {}
         self._reached: dict[str, int] = {}
         self._lacking: set[str] = set()
@@ -52,7 +53,7 @@ class Lockstep:
         self._patience = self._usual = RESEND
         self._began = -np.inf
         self._farewells = 0
-        self._outbox: tuple[np.ndarray, np.ndarray] | None = None
+        self._outbox: tuple[Rows, Rows] | None = None
         self._state: Any = None
         self._store = None if memory is None else Store(memory, self._size())
         self._recall()
@@ -85,7 +86,7 @@ class Lockstep:
             elif now - self._spoke >= self._patience:
                 self._repeat(now)
         if not self._over() and now - self._began > max(SILENT, 3.0 * self._period):  # while the agent waits, what it knew grows old
-            station.conclude(False, float(self._round))
+            station.conclude(float(self._round), lately=False)
         due = station.watch()
         if self._ready() and self._state is not None:
             return min(due, self._began + self._period)
@@ -96,8 +97,7 @@ class Lockstep:
             if message.kind is Kind.HELLO:
                 self._lacking.add(message.source)
             elif message.kind is Kind.STATE:
-                current, previous, number = message.arrays
-                reached = int(number[0])
+                current, previous, reached = message.arrays[:2], message.arrays[2:4], int(message.arrays[4][0])
                 if reached > self._round and not self._confirmed(message.source, reached):
                     continue
                 if reached == self._reached.get(message.source):
@@ -166,7 +166,7 @@ class Lockstep:
         assert self._outbox is not None
         current, previous = (station.blocks(outbox) for outbox in self._outbox)
         number = np.array([self._round - 1.0])
-        self._said = {neighbour: [block, previous[neighbour], number] for neighbour, block in current.items()}
+        self._said = {neighbour: [*told, *previous[neighbour], number] for neighbour, told in current.items()}
         self._lacking.clear()
         self._spoke = now
         station.say(self._said)
@@ -192,14 +192,18 @@ class Lockstep:
             return
         place = {end: k for k, end in enumerate(before.ends)}
         rows = [place.get(end, -1) for end in station.core.ends]
-        if min(rows, default=0) >= 0:
-            self._outbox = self._outbox[0][rows], self._outbox[1][rows]
-        else:  # somebody joined, to whom nothing was said yet
+        if min(rows, default=0) >= 0 and not self._outbox[0].pair.size:
+            self._outbox = self._among(rows, self._outbox[0]), self._among(rows, self._outbox[1])
+        else:  # somebody joined, to whom nothing was said yet; or what was said to neighbours as a whole is of a team that is no more
             inbox, nothing = station.empty()
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
             self._outbox = outbox, outbox
         self._save()
         self._speak(station.clock())
+
+    def _among(self, rows: list[int], said: Rows) -> Rows:
+        """What was said to those who are still there, in protocols that say nothing to neighbours as a whole."""
+        return Rows(said.link[rows], np.zeros((len(self.station.present), 0)))
 
     # -- memory ------------------------------------------------------------------------------------------------------------------------
 
@@ -207,7 +211,9 @@ class Lockstep:
         """Of the record when everybody is there, the most that there can be."""
         everyone = self.station.core.among(frozenset())
         state = everyone.begin(self.station.part.first)
-        numbers = sum(np.size(leaf) for leaf in jax.tree.leaves(state)) + 2 * len(everyone.ends) * everyone.width
+        longest = max((letter.shape[0] for letter in everyone.letters.values()), default=0)
+        said = len(everyone.ends) * everyone.width + len(everyone.part.neighbours) * longest
+        numbers = sum(np.size(leaf) for leaf in jax.tree.leaves(state)) + 2 * said
         return 8 * (numbers + self.station.part.team.count + 1)
 
     def _save(self) -> None:
@@ -215,7 +221,8 @@ class Lockstep:
             return
         leaves = [np.asarray(leaf, dtype=float).ravel() for leaf in jax.tree.leaves(self._state)]
         epochs = self.station.membership.of(self.station.part.team.ids)
-        self._store.save(np.concatenate([[float(self._round)], epochs, *(box.ravel() for box in self._outbox), *leaves]).tobytes())
+        said = [box.ravel() for rows in self._outbox for box in rows]
+        self._store.save(np.concatenate([[float(self._round)], epochs, *said, *leaves]).tobytes())
 
     def _recall(self) -> None:
         record = None if self._store is None else self._store.load()
@@ -227,16 +234,20 @@ class Lockstep:
         self._round = int(numbers[0])
         station.membership.restore(ids, numbers[1 : 1 + len(ids)])
         station.regroup(None, station.part.first)
-        ends, width = len(station.core.ends), station.core.width
         at = 1 + len(ids)
-        boxes = numbers[at : at + 2 * ends * width].reshape(2, ends, width)
-        at += 2 * ends * width
-        leaves, structure = jax.tree.flatten(station.core.begin(station.among(station.part.first)))
-        restored = []
-        for leaf in leaves:
-            restored.append(numbers[at : at + np.size(leaf)].reshape(np.shape(leaf)))
-            at += np.size(leaf)
-        self._state = jax.tree.unflatten(structure, restored)
-        self._outbox = boxes[0], boxes[1]
+
+        def read(like: Any) -> Any:
+            """Numbers of the same shapes, from where the last ended."""
+            nonlocal at
+            leaves, structure = jax.tree.flatten(like)
+            restored = []
+            for leaf in leaves:
+                restored.append(numbers[at : at + np.size(leaf)].reshape(np.shape(leaf)))
+                at += np.size(leaf)
+            return jax.tree.unflatten(structure, restored)
+
+        nothing, _ = station.empty()
+        self._outbox = read(nothing), read(nothing)
+        self._state = read(station.core.begin(station.among(station.part.first)))
         station.log("resumed", round=self._round)
         self._speak(station.clock())

@@ -15,16 +15,15 @@ from consat.network.core import Embodied, RoundCore
 from consat.network.link_core import LinkCore
 from consat.network.lockstep import Lockstep
 from consat.network.paced import Paced
-from consat.network.part import Part
+from consat.network.pair_core import PairCore
+from consat.network.part import RUNS, Part
 from consat.network.station import REPORT, Log, Station
 from consat.network.transports import Transport
-from consat.protocols import ROUNDS, with_gains
+from consat.protocols import PAIRED, ROUNDS, with_gains
 
-Mode = Literal["lockstep", "link", "admm"]
-DEFAULT_MODE: Final = "admm"
-LINK: Final = "gradient-flow"
-"""The protocol of mode link."""
-RATE: Final = {"admm": 100.0, "link": 50.0}
+Mode = Literal["interior-point", "admm", "link", "lockstep"]
+DEFAULT_MODE: Final = "interior-point"
+RATE: Final = {"interior-point": 100.0, "admm": 100.0, "link": 50.0}
 """Turns a second where nobody says, Hz."""
 
 
@@ -92,18 +91,26 @@ def protocol_of(mode: Mode, asked: str | None) -> str:
     Raises:
         InvalidSettings: the mode does not run the protocol that is asked for.
     """
-    if mode == "link":
-        if asked not in (None, LINK):
-            raise InvalidSettings(
-                f"mode link runs the protocol {LINK}, but the protocol is {asked}; mode lockstep runs protocols in rounds"
-            )
-        return LINK
-    kind = asked or DEFAULT_MODE
+    kind = asked or RUNS[mode]
+    if mode == "link" and kind != RUNS["link"]:
+        raise InvalidSettings(
+            f"mode link runs the protocol {RUNS['link']}, but the protocol is {kind}; mode lockstep runs protocols in rounds"
+        )
+    if mode == "interior-point" and kind not in PAIRED:
+        raise InvalidSettings(
+            f"mode interior-point runs the protocols {' and '.join(PAIRED)}, but the protocol is {kind}; "
+            "mode lockstep runs every protocol in rounds"
+        )
     if mode == "admm" and kind != "admm":
         raise InvalidSettings(f"mode admm runs the protocol admm, but the protocol is {kind}; mode lockstep runs every protocol in rounds")
-    if kind not in ROUNDS:
+    if mode == "lockstep" and kind not in ROUNDS:
         raise InvalidSettings(f"mode lockstep runs protocols in rounds, {', '.join(ROUNDS)}, but the protocol is {kind}")
     return kind
+
+
+def mode_for(kind: str | None) -> Mode:
+    """How agents talk where nobody says, given the protocol that they are to run."""
+    return "admm" if kind == "admm" else DEFAULT_MODE
 
 
 def core_of(part: Part, manner: Manner) -> Embodied:
@@ -113,7 +120,8 @@ def core_of(part: Part, manner: Manner) -> Embodied:
     if manner.mode == "link":
         gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
         return Embodied(LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace))
-    return Embodied(RoundCore(with_gains(ROUNDS[kind](), asked), part))
+    protocol = with_gains(ROUNDS[kind](), asked)
+    return Embodied(PairCore(protocol, part) if kind in PAIRED else RoundCore(protocol, part))
 
 
 def runner_of(

@@ -6,6 +6,7 @@ After a start or restart an agent stands still and is silent but for greetings, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -36,7 +37,7 @@ class Paced:
         self.station = station
         self.done = False
         self._period, self._turns, self._stale = 1.0 / rate, turns, max(stale, 3.0 / rate)
-        self._latest: dict[str, np.ndarray] = {}
+        self._latest: dict[str, Sequence[np.ndarray]] = {}
         self._state: Any = None
         self._count = self._regrouped = 0
         self._due = self._last = station.clock()
@@ -54,7 +55,7 @@ class Paced:
         station = self.station
         for message in station.hear():
             if message.kind is Kind.STATE:
-                self._latest[message.source] = message.arrays[0]
+                self._latest[message.source] = message.arrays
         now = station.clock()
         if now < self._due:
             return self._due
@@ -95,8 +96,8 @@ class Paced:
             self._state = station.regroup(self._state, station.first())
             self._regrouped = self._count
         inbox, arrived = station.empty()
-        for neighbour, block in self._latest.items():
-            station.sort(neighbour, block, inbox, arrived)
+        for neighbour, told in self._latest.items():
+            station.sort(neighbour, told, inbox, arrived)
         self._latest.clear()
         moment = Moment(
             float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place()
@@ -104,7 +105,7 @@ class Paced:
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1
-        station.say({neighbour: [block] for neighbour, block in station.blocks(outbox).items()})
+        station.say(station.blocks(outbox))
         station.move(look, now)
         if self._turns is not None and self._count >= self._turns:
             self.done = True

@@ -2,7 +2,8 @@
 
 `split` makes the parts of a scenario, `write_part` and `read_part` put them into private files. A file is a scenario of one agent, in the
 same words, in a frame that says how it talks to its neighbours; nothing in it is ever evaluated. It tells of the other agents only their
-names, and of neighbours their addresses, which positions both hold, and how many links share each at the other end.
+names, and of neighbours their addresses, which positions both hold, how many links share each at the other end, and what travels between
+them.
 """
 
 from __future__ import annotations
@@ -29,9 +30,13 @@ from consat.settings import Gain, Model, Number, Settings, Smoothing
 from consat.teams.family import Family
 from consat.teams.team import Agent, Team
 
-VERSION: Final = 1
+VERSION: Final = 2
+"""Since parts tell along which links positions and the level travel. Others are refused."""
 PORT: Final = 7447
 """Of the first agent, where nobody says."""
+
+RUNS: Final = {"interior-point": "interior-point", "admm": "admm", "link": "gradient-flow", "lockstep": "interior-point"}
+"""The protocol of each mode, where nobody names one."""
 
 Word = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 Endpoint = Annotated[str, StringConstraints(pattern=r"^(tcp|tls|udp|quic)/[^\s/]+:[0-9]{1,5}$")]
@@ -45,12 +50,16 @@ class Neighbour(Model):
         address: where it listens.
         shares: the agents whose positions both ends hold, in the team's order.
         degrees: for each of them, over how many links the neighbour shares it.
+        travels: those of `shares` whose positions travel over this link in the interior-point protocol, each along a tree of its holders.
+        level: whether the level does, along a spanning tree of the cluster.
     """
 
     id: Word
     address: Endpoint
     shares: tuple[Word, ...] = Field(min_length=1)
     degrees: tuple[Annotated[int, Field(ge=1, le=10**6)], ...]
+    travels: tuple[Word, ...]
+    level: bool
 
 
 class _File(Model):
@@ -61,6 +70,7 @@ class _File(Model):
     agent: Word
     listen: Endpoint
     length: Gain
+    psi: Gain
     center: tuple[Number, ...]
     reach: Gain
     convex: bool
@@ -81,6 +91,7 @@ class Part:
         me: the agent.
         listen: its own address.
         length: the team's unit of length.
+        psi: the team's unit of ψ.
         center: (d,) the team's middle.
         reach: how far around it the team's places are; see `consat.scale.Region`.
         convex: whether every ψ of the team is proven concave.
@@ -97,6 +108,7 @@ class Part:
     me: str
     listen: str
     length: float
+    psi: float
     center: np.ndarray
     reach: float
     convex: bool
@@ -117,10 +129,12 @@ class Part:
 
     def problem(self, mode: str) -> bytes:
         """8 bytes that agree among agents of the same run, mode and common knowledge; nothing private is in them."""
+        settings = self.settings.model_dump(mode="json", include={"protocol", "smoothing"})
+        settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
-            "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "hops": self.hops,
-            "center": self.center.tolist(), "reach": self.reach, "convex": self.convex,
-            "settings": self.settings.model_dump(mode="json", include={"protocol", "smoothing"}),
+            "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "psi": self.psi,
+            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex,
+            "settings": settings,
         }  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
 
@@ -135,7 +149,12 @@ class Part:
             shares = tuple(agent for agent in neighbour.shares if agent not in gone)
             if shares and neighbour.id not in gone:
                 known = degrees[neighbour.id]
-                neighbours.append(neighbour.model_copy(update={"shares": shares, "degrees": tuple(known[agent] for agent in shares)}))
+                kept_of = {
+                    "shares": shares,
+                    "degrees": tuple(known[agent] for agent in shares),
+                    "travels": tuple(agent for agent in neighbour.travels if agent not in gone),
+                }
+                neighbours.append(neighbour.model_copy(update=kept_of))
         return replace(self, team=_restricted(self.team, kept), first=self.first[kept], neighbours=tuple(neighbours))
 
 
@@ -188,6 +207,8 @@ def split(
 ) -> dict[str, Part]:
     """The parts of a scenario, by agent.
 
+    Who holds what, and along which links it travels, suits the protocol that the scenario names, or the team's default.
+
     Args:
         scenario: whose protocol, seed and smoothing are those of the run.
         run: its name on the network; if None, one that everybody who splits the same scenario finds.
@@ -201,10 +222,10 @@ def split(
         InvalidSettings: an address or an absent agent that the team does not have.
     """
     from consat.central.quadratics import shape_of
-    from consat.estimates import Estimates
     from consat.graphs import hops
+    from consat.interior import Shared
     from consat.objective import Schedule
-    from consat.runs.preparation import first_estimates
+    from consat.runs.preparation import DEFAULT_PROTOCOL, copies_of, default_protocol, first_estimates
     from consat.scale import automatic, scale
 
     team, settings = scenario.team, scenario.settings
@@ -214,10 +235,12 @@ def split(
             raise InvalidSettings(f"there is no agent {named!r}{closest(named, team.ids)}")
     if not 1 <= port <= 65536 - team.count:
         raise InvalidSettings(f"port is {port}, but must leave room for {team.count} ports below 65536")
-    copies, size = Estimates.of(team, settings.protocol.estimates), scale(team)
+    copies, size = copies_of(team, settings.protocol), scale(team)
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+    default = default_protocol(team, settings.protocol.estimates)
+    named = settings.protocol.kind or (None if default == DEFAULT_PROTOCOL else default)
     common = Settings(
-        protocol=settings.protocol,
+        protocol=settings.protocol.model_copy(update={"kind": named}),
         smoothing=Smoothing(nu_alpha=float(schedule.final.alpha), nu_beta=float(schedule.final.beta)),
     )
     first, concave = first_estimates(team, copies, settings.start, size), shape_of(team).concave
@@ -225,6 +248,9 @@ def split(
     degree = np.bincount(copies.edges[:, 0], minlength=copies.count)
     run = run or f"{_word(scenario.name)}-{hashlib.sha256(scenario.text.encode()).hexdigest()[:12]}"
     across = hops(team.count, copies.links)
+    shared = Shared.of(copies)
+    pair_of = {(int(here), int(there)): k for k, (here, there) in enumerate(shared.pairs)}
+    rows_of = np.split(shared.row, np.searchsorted(shared.pair, np.arange(1, max(len(shared.pairs), 1))))
     parts = {}
     for owner, agent in enumerate(team.ids):
         if only is not None and agent != only:
@@ -234,17 +260,19 @@ def split(
         others = copies.holder[ends[:, 1]]
         neighbours = []
         for other in np.unique(others):
-            far = ends[others == other, 1]
+            far, shares = ends[others == other, 1], rows_of[pair_of[owner, int(other)]]
             neighbours.append(
                 Neighbour(
                     id=team.ids[other],
                     address=listen[other],
                     shares=tuple(team.ids[i] for i in copies.position[far]),
                     degrees=tuple(map(int, degree[far])),
+                    travels=tuple(team.ids[i] for i in copies.position[shares[shares >= 0]]),
+                    level=bool((shares < 0).any()),
                 )
             )
         parts[agent] = Part(
-            scenario.name, run, agent, listen[owner], size.length, size.center, size.reach, bool(concave.all()), across,
+            scenario.name, run, agent, listen[owner], size.length, size.psi, size.center, size.reach, bool(concave.all()), across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
         )  # fmt: skip
     return parts
@@ -269,6 +297,7 @@ def write_part(part: Part) -> str:
             "agent": part.me,
             "listen": part.listen,
             "length": part.length,
+            "psi": part.psi,
             "center": part.center.tolist(),
             "reach": part.reach,
             "convex": part.convex,
@@ -317,7 +346,7 @@ def read_part(text: str, file: str) -> Part:
     if faults := list(_unfit(frame, team, settings)):
         raise document.invalid(faults)
     return Part(
-        name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, np.array(frame.center, dtype=float),
+        name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
         frame.reach, frame.convex, frame.hops, team, settings,
         np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
     )  # fmt: skip
@@ -374,3 +403,5 @@ def _unfit_neighbours(frame: _File, team: Team) -> Iterator[Fault]:
             yield Fault((*path, "shares"), f"{unknown[0]!r} is not among the agents of the scenario within")
         elif sorted(neighbour.shares, key=team.ids.index) != list(dict.fromkeys(neighbour.shares)):
             yield Fault((*path, "shares"), "it must name each agent once, in the order of the scenario within")
+        elif list(neighbour.travels) != [agent for agent in neighbour.shares if agent in neighbour.travels]:
+            yield Fault((*path, "travels"), "it must name agents of shares, each once, in their order")

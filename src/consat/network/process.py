@@ -35,7 +35,7 @@ from consat.network.transports.weather import Weathered
 NAP: Final = 0.05
 """No wait is longer, s, so that signals and commands are soon seen."""
 LINGER: Final = 2.0
-"""An agent that is done because all are satisfied goes on so long, s, so that its neighbours learn of it."""
+"""An agent that is done because of what it knows goes on so long, s, so that its neighbours learn of it."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Circumstances:
         sensor_timeout: after so long without a measurement, s, the body is commanded to stand.
         position: where a simulated body is; None for the start in the part.
         until: when to stop, s; None for never.
-        stop: whether to stop once all are known to be satisfied.
+        stop: whether to stop once all are known to be satisfied, or to be near the best where they cannot be.
         attached: stop when stdin ends, as it does when the process that started this one dies.
         keys: folder of the team's or the agent's keys; None for a network without protection.
     """
@@ -114,7 +114,7 @@ def _loop(runner: Runner, transport: Transport, orders: Orders, helm: Helm, arou
             orders.leaving = False
             helm.stand()
             runner.leave()
-        known_since = min(known_since, now) if station.satisfied else math.inf
+        known_since = min(known_since, now) if station.settled else math.inf
         if runner.done:
             return "done"
         if orders.stopped:
@@ -122,15 +122,14 @@ def _loop(runner: Runner, transport: Transport, orders: Orders, helm: Helm, arou
         if now >= end:
             return "out of time"
         if around.stop == "satisfied" and now - known_since >= LINGER:
-            return "satisfied"
+            return str(station.known)
         transport.wait(min(max(due - now, 0.0), NAP))
 
 
 def _warm(core: Embodied) -> None:
     """Compile before the first neighbour can wait for it."""
-    count = len(core.ends)
-    moment = Moment(0.0, 1.0, np.zeros(count), np.ones(count, dtype=bool), np.zeros(core.part.team.dimension))
-    _, _, look = core.turn(core.begin(core.part.first), np.zeros((count, core.width)), np.zeros(count, dtype=bool), moment)
+    moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
+    _, _, look = core.turn(core.begin(core.part.first), *core.empty(), moment)
     core.margin(look.bodies)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from consat.network import guard
 from consat.network.body import Body
-from consat.network.core import LARGEST, Embodied, Look, Moment
+from consat.network.core import LARGEST, Embodied, Look, Moment, Rows
 from consat.network.membership import Membership
 from consat.network.part import Part
 from consat.network.peers import Peers
@@ -21,6 +21,8 @@ SILENT: Final = 0.5
 REPORT: Final = 0.1
 """Time between two reports, s."""
 
+Knowledge = Literal["satisfied", "infeasible"] | None
+"""What an agent knows of the whole team: that all are satisfied; that they cannot be, proven; or neither."""
 Log = Callable[[dict[str, Any]], None]
 
 
@@ -63,7 +65,10 @@ class Station:
         self.peers = Peers(
             part,
             part.problem(mode),
-            {neighbour.id: _expected(len(neighbour.shares), core.largest, frames, stamped) for neighbour in part.neighbours},
+            {
+                neighbour.id: _expected(len(neighbour.shares), core.largest, core.letters[neighbour.id], frames, stamped)
+                for neighbour in part.neighbours
+            },
             transport,
             clock,
             incarnation,
@@ -71,7 +76,8 @@ class Station:
         self._log, self._give_up, self._period = log, give_up, report
         self._born = clock()
         self._track: list[list[float]] = []
-        self._satisfied = False
+        self._known: Knowledge = None
+        self._near = False
         self._down = frozenset(self.peers.all)
         self._next_report = clock()
         self._gone: frozenset[str] = frozenset()
@@ -103,7 +109,7 @@ class Station:
             neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
             for neighbour in self.part.neighbours
         }
-        self._waiting = {neighbour: self.peers.all[neighbour] for neighbour in self.present}
+        self._turn_of = {neighbour: k for k, neighbour in enumerate(self.present)}
         return state
 
     def among(self, first: np.ndarray) -> np.ndarray:
@@ -126,7 +132,17 @@ class Station:
     @property
     def satisfied(self) -> bool:
         """Whether it knows that all are."""
-        return self._satisfied
+        return self._known == "satisfied"
+
+    @property
+    def known(self) -> Knowledge:
+        """What it knows of the team."""
+        return self._known
+
+    @property
+    def settled(self) -> bool:
+        """Whether it knows all that there is to find: that all are satisfied, or that they cannot be and are near the best."""
+        return self.satisfied or (self._known == "infeasible" and self._near)
 
     # -- messages ----------------------------------------------------------------------------------------------------------------------
 
@@ -145,28 +161,38 @@ class Station:
                 self.membership.drop(neighbour)
         return messages
 
-    def blocks(self, outbox: np.ndarray) -> dict[str, np.ndarray]:
-        """What to tell each neighbour of the rows that the core says: (shares, width + 1), zeros for who is gone, then who is there."""
+    def blocks(self, outbox: Rows) -> dict[str, list[np.ndarray]]:
+        """What to tell each neighbour: of the rows that the core says of links, (shares, width + 1), zeros for who is gone, and last who is
+        there; and of those that it says to neighbours its own."""
         told = {}
         for neighbour, place in self._places.items():
             block = np.zeros((len(place), self.core.width + 1))
-            block[place >= 0, :-1] = outbox[place[place >= 0]]
+            block[place >= 0, :-1] = outbox.link[place[place >= 0]]
             block[:, -1] = self.membership.of(self.peers.all[neighbour].known.shares)
-            told[neighbour] = block
+            letter, row = np.zeros(self.core.letters[neighbour].shape), self._turn_of.get(neighbour)
+            if row is not None:
+                letter = outbox.pair[row, : len(letter)]
+            told[neighbour] = [block, letter]
         return told
 
-    def empty(self) -> tuple[np.ndarray, np.ndarray]:
-        """(E, width) and (E,): nothing has come."""
-        return np.zeros((len(self.core.ends), self.core.width)), np.zeros(len(self.core.ends), dtype=bool)
+    def empty(self) -> tuple[Rows, Rows]:
+        """Nothing has come."""
+        return self.core.empty()
 
-    def sort(self, neighbour: str, block: np.ndarray, inbox: np.ndarray, arrived: np.ndarray) -> None:
-        """Put what a neighbour said into the rows of the ends, as far as both know the same agents to be there."""
-        place = self._places[neighbour]
-        agrees = (place >= 0) & (block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares))
-        inbox[place[agrees]] = block[agrees, :-1]
-        arrived[place[agrees]] = True
+    def sort(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
+        """Put what a neighbour said into the rows of the ends, as far as both know the same agents to be there; and what it said as a whole
+        where they agree on all."""
+        block, letter = told
+        place, row = self._places[neighbour], self._turn_of.get(neighbour)
+        same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
+        agrees = (place >= 0) & same
+        inbox.link[place[agrees]] = block[agrees, :-1]
+        arrived.link[place[agrees]] = True
+        if row is not None and same.all():
+            inbox.pair[row, : len(letter)] = letter
+            arrived.pair[row] = True
 
-    def turn(self, state: Any, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[Any, np.ndarray, Look]:
+    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, Look]:
         """See `Embodied.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
@@ -233,15 +259,26 @@ class Station:
         if position is not None:
             self._track.append([stamp, *position.tolist()])
         self._look = look
-        self.conclude(look.known > 0, stamp)
+        self.conclude(stamp)
         if self._period <= 0:
             self.report()
 
-    def conclude(self, satisfied: bool, stamp: float) -> None:
-        """Whether the agent knows that all are satisfied; told if it is news."""
-        if satisfied != self._satisfied:
-            self._satisfied = satisfied
-            self.log("satisfied" if satisfied else "unsatisfied", stamp=stamp)
+    def conclude(self, stamp: float, *, lately: bool = True) -> None:
+        """What the agent knows of the team, told if it is news; lately: whether it has heard of the others lately, without which it knows
+        nothing of where they are."""
+        look, before = self._look, (self._known, self._near)
+        self._known, self._near = None, False
+        if look is not None and lately and look.known > 0:
+            self._known = "satisfied"
+        elif look is not None and look.bound < 0:
+            self._known, self._near = "infeasible", lately and look.near
+        if before != (self._known, self._near):
+            if self._known is None:
+                self.log("unsatisfied" if before[0] == "satisfied" else "undecided", stamp=stamp)
+            elif self._known == "satisfied":
+                self.log("satisfied", stamp=stamp)
+            elif look is not None:
+                self.log("infeasible", stamp=stamp, near=self._near, bound=look.bound, margin=_number(look.least))
 
     def _me(self) -> int:
         """The agent's row among those who are there."""
@@ -271,7 +308,7 @@ class Station:
         """How things stand, and where the body was since the last report.
 
         `margin` is that of the agent at its `position`, and where it last heard that the others' bodies are; `estimate_margin` at its
-        estimates.
+        estimates; `bound` is proven to be at least the best margin that the team can have.
         """
         look, position = self._look, self.body.position()
         margin = estimate_margin = None
@@ -295,6 +332,7 @@ class Station:
             margin=margin,
             estimate_margin=estimate_margin,
             known=None if look is None else look.known,
+            bound=None if look is None else _number(look.bound),
             track=self._track,
             peers=peers,
             sent=dict(self.peers.sent),
@@ -308,11 +346,11 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _expected(shares: int, largest: np.ndarray, frames: int, stamped: bool) -> Expected:
+def _expected(shares: int, largest: np.ndarray, letter: Numbers, frames: int, stamped: bool) -> Expected:
     """What messages of a neighbour hold; the last number of each row tells who is there."""
-    frame = Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST))
+    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), letter]
     return {
         Kind.HELLO: [(shares,)],
-        Kind.STATE: [*[frame] * frames, *[(1,)] * stamped],
+        Kind.STATE: [*frame * frames, *[(1,)] * stamped],
         Kind.GOODBYE: [],
     }

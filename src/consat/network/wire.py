@@ -1,4 +1,4 @@
-"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 2.
+"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 3.
 
     offset  bytes  what
     0       4      b"csat"
@@ -37,8 +37,8 @@ import numpy as np
 from consat.errors import NetworkError, shown
 
 MAGIC: Final = b"csat"
-VERSION: Final = 2
-"""Since messages tell of bodies. Others are refused."""
+VERSION: Final = 3
+"""Since messages hold what is for a neighbour as a whole. Others are refused."""
 LONGEST: Final = 2**22
 """No message has more bytes."""
 MOST_ARRAYS: Final = 32
@@ -80,6 +80,7 @@ class Reason(StrEnum):
     KIND = "kind"
     SHAPE = "shape"
     NUMBER = "number"
+    SENSE = "sense"
     DUPLICATE = "duplicate"
     STALE = "stale"
     JUMP = "jump"
@@ -122,10 +123,12 @@ class Numbers(NamedTuple):
     Attributes:
         shape: (n,) or (rows, columns).
         largest: no magnitude is above it, or above that of its column. With inf, infinities may stand there; NaN may stand nowhere.
+        sound: whether numbers within these limits, flat, make sense together; None where any do.
     """
 
     shape: tuple[int, ...]
     largest: float | tuple[float, ...] = sys.float_info.max
+    sound: Callable[[np.ndarray], bool] | None = None
 
 
 Expected = Mapping[Kind, Sequence[Numbers | tuple[int, ...]]]
@@ -262,8 +265,10 @@ class Checker:
         if at + layout.bytes != end or count != layout.count or not payload.startswith(layout.shapes, at):
             return Reason.SHAPE
         numbers = np.frombuffer(payload, "<f8", layout.numbers, at + len(layout.shapes)).astype(float)  # a copy, aligned
-        if not (math.isfinite(sent) and not math.isinf(echo) and 0 <= nu_beta < math.inf and (np.abs(numbers) <= layout.largest).all()):
+        if not (math.isfinite(sent) and not math.isinf(echo) and 0 <= nu_beta < math.inf):
             return Reason.NUMBER
+        if (wrong := layout.wrong(numbers)) is not None:
+            return wrong
         if (refused := neighbour.window.refuse(incarnation, sequence, self._clock(), self._quiet)) is not None:
             return refused
         return Message(
@@ -281,6 +286,7 @@ class _Layout:
         slices: of each array, where its numbers begin and end among all, and its shape.
         numbers: how many, in all arrays.
         largest: the largest magnitude of each number, or of all.
+        sound: of arrays that are to make sense, where their numbers begin and end, and what tells.
         bytes: of shapes and numbers.
     """
 
@@ -289,6 +295,7 @@ class _Layout:
     slices: tuple[tuple[int, int, tuple[int, ...]], ...]
     numbers: int
     largest: np.ndarray
+    sound: tuple[tuple[int, int, Callable[[np.ndarray], bool]], ...]
     bytes: int
 
     @classmethod
@@ -305,7 +312,14 @@ class _Layout:
         total = len(shapes) + 8 * sum(sizes)
         if len(each) > MOST_ARRAYS or total > LONGEST:
             raise NetworkError(f"a message may have at most {MOST_ARRAYS} arrays and {LONGEST} bytes, not {len(each)} and {total}")
-        return cls(len(each), shapes, slices, sum(sizes), largest, total)
+        sound = tuple((begin, end, array.sound) for (begin, end, _), array in zip(slices, each, strict=True) if array.sound is not None)
+        return cls(len(each), shapes, slices, sum(sizes), largest, sound, total)
+
+    def wrong(self, numbers: np.ndarray) -> Reason | None:
+        """What is, with the numbers of a message."""
+        if not (np.abs(numbers) <= self.largest).all():
+            return Reason.NUMBER
+        return None if all(sound(numbers[begin:end]) for begin, end, sound in self.sound) else Reason.SENSE
 
     def cut(self, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
         numbers.flags.writeable = False

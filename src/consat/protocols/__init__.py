@@ -22,6 +22,9 @@ ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {
 }  # fmt: skip
 """What ``--protocol`` may say of rounds."""
 
+PAIRED: Final = tuple(name for name, protocol in ROUNDS.items() if protocol().speaks == "pair")
+"""Protocols that speak to each neighbour as a whole, not copy by copy."""
+
 
 def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
     """The protocol with the gains that the scenario asks for. Raises: InvalidSettings: it has no such gain."""
@@ -32,20 +35,6 @@ def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
 
 
 __all__ = [
-    "FLOWS",
-    "ROUNDS",
-    "Admm",
-    "Flow",
-    "GradientFlow",
-    "InteriorPoint",
-    "Known",
-    "Links",
-    "Local",
-    "ProportionalIntegral",
-    "Proximal",
-    "Rounds",
-    "Selfish",
-    "Solver",
-    "State",
-    "with_gains",
+    "FLOWS", "PAIRED", "ROUNDS", "Admm", "Flow", "GradientFlow", "InteriorPoint", "Known", "Links", "Local", "ProportionalIntegral",
+    "Proximal", "Rounds", "Selfish", "Solver", "State", "with_gains",
 ]  # fmt: skip

@@ -16,10 +16,10 @@ from consat.errors import InvalidInput, InvalidSettings, counted
 from consat.estimates import Estimates, Layout
 from consat.interior import route_of
 from consat.objective import Schedule
-from consat.protocols import FLOWS, ROUNDS
+from consat.protocols import FLOWS, PAIRED, ROUNDS
 from consat.scale import Scale, automatic, scale, start_box
 from consat.scenario import Scenario, dump, load
-from consat.settings import Settings, Start
+from consat.settings import ProtocolSettings, Settings, Start
 from consat.teams.team import Team
 
 DEFAULT_PROTOCOL = "interior-point"
@@ -27,8 +27,6 @@ MANY = 20_000
 """Teams of more agents than these run admm where nobody says: its rounds take less time."""
 FULL = 30
 """Likewise teams of more agents than these where everybody holds everything."""
-PAIRED = ("interior-point", "max-min")
-"""Protocols that speak to each neighbour as a whole, not copy by copy."""
 SHARP = 5e-4
 """Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
 
@@ -82,6 +80,12 @@ def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settin
     return settings
 
 
+def copies_of(team: Team, asked: ProtocolSettings) -> Estimates:
+    """Who holds what, as suits a protocol; that of the team where none is named."""
+    kind = asked.kind or default_protocol(team, asked.estimates)
+    return route_of(team, asked.estimates)[1] if kind in PAIRED else Estimates.of(team, asked.estimates)
+
+
 class Prepared(NamedTuple):
     """A team made ready to run.
 
@@ -104,9 +108,7 @@ class Prepared(NamedTuple):
         """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
         size = scale(team)
         schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-        layout = settings.protocol.estimates
-        copies = route_of(team, layout)[1] if settings.protocol.kind in PAIRED else Estimates.of(team, layout)
-        return cls(team, copies, schedule, size, settings)
+        return cls(team, copies_of(team, settings.protocol), schedule, size, settings)
 
     def first(self, start: Start | None = None) -> np.ndarray:
         """(C, d) first estimates, drawn as the settings say, or otherwise."""

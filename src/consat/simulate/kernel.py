@@ -18,6 +18,7 @@ from consat.interior import Interior
 from consat.numerics import Groups, pick
 from consat.objective import Nu, Objective
 from consat.protocols import InteriorPoint, Known, Rounds, agreement
+from consat.protocols.interior_point import EXACTLY, near
 from consat.scale import Region, Scale
 from consat.solver import EXACT, LocalSolver
 from consat.teams.family import distinct
@@ -325,8 +326,6 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, Array]:
 SATISFIED, INFEASIBLE, NEAR, BEST = 1, 2, 4, 8
 """What all agents know, as bits: that all are satisfied; that the team cannot be satisfied; and that its margin is proven to be near the
 best, or the best to `EXACTLY`."""
-NEARLY, EXACTLY = 0.05, 1e-3
-"""Near is within this part of the bound, or within `EXACTLY` in units of ψ; both of what the agents know."""
 
 
 def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Array:
@@ -341,11 +340,10 @@ def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Arr
     idle = jnp.isinf(margin) & (everyone.interior.degree == 0)
     torn = bound < 0
     proven = jnp.isfinite(bound)
-    near = proven & (gap <= jnp.maximum(NEARLY * jnp.abs(bound), EXACTLY * unit))
     best = proven & (gap <= EXACTLY * jnp.maximum(unit, jnp.abs(bound)))
     some = jnp.any(torn)
     known += jnp.where(jnp.all(satisfied | torn | idle) & some, INFEASIBLE, 0)
-    known += jnp.where(jnp.all(satisfied | (torn & near) | idle) & some, NEAR, 0)
+    known += jnp.where(jnp.all(satisfied | (torn & near(bound, least, unit)) | idle) & some, NEAR, 0)
     return known + jnp.where(jnp.all(best | idle), BEST, 0)
 
 
