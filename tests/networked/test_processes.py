@@ -83,7 +83,10 @@ def test_launch_gathers_a_result_as_any_run() -> None:
 @pytest.fixture(scope="module")
 def truth() -> dict[str, np.ndarray]:
     """(T, d) of each agent, as `simulate` has it when every product is rounded by itself."""
-    environment = os.environ | {"XLA_FLAGS": "--xla_cpu_max_isa=AVX", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {
+        "XLA_FLAGS": "--xla_cpu_max_isa=AVX",
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
     done = subprocess.run(
         [sys.executable, "-m", "tests.networked.oracle", "truth"], cwd=ROOT, env=environment, capture_output=True, timeout=START, check=True
     )
@@ -193,7 +196,8 @@ agents:
 
 
 def test_an_agent_follows_its_sensor_under_its_speed_limit(tmp_path: Path) -> None:
-    """Its position is measured by somebody else, here on the way from (3, 4) to the centre of the disc; it commands velocities."""
+    """Its position is measured by somebody else, here on the way from (3, 4) to the centre of the disc; it commands velocities, and at the
+    end to stand."""
     (tmp_path / "solo.yaml").write_text(SOLO)
     port = str(free_ports(1)[0])
     command = [*CONSAT, "agent", str(tmp_path / "solo.yaml"), "--id", "solo", "--sensor", "stdin", "--speed", "0.5", "--port", port]
@@ -201,17 +205,20 @@ def test_an_agent_follows_its_sensor_under_its_speed_limit(tmp_path: Path) -> No
         try:
             assert agent.stdin is not None
             assert agent.stdout is not None
-            agent.stdin.write('what is this\n{"position": [3, NaN]}\n{"position": [3, 4]}\n')
-            agent.stdin.flush()
+            agent.stdin.write('what is this\n{"position": [3, NaN]}\n')
             events: list[dict[str, Any]] = []
             for line in agent.stdout:
+                agent.stdin.write('{"position": [3, 4]}\n')
+                agent.stdin.flush()
                 events.append(json.loads(line))
                 if events[-1]["event"] == "command" and np.linalg.norm(events[-1]["velocity"]) > 0.4:
                     break
-            agent.stdin.write('{"command": "stop"}\n')
-            agent.stdin.close()
-            assert agent.wait(START) == 0
+            agent.send_signal(signal.SIGTERM)
+            rest = [json.loads(line) for line in agent.stdout]
+            assert agent.wait(START) == 0  # while its stdin is open, and a thread waits for what comes there
         finally:
             agent.kill()
-    assert {event["line"] for event in events if event["event"] == "rejected"} == {"what is this", '{"position": [3, NaN]}'}
+    commands = [event for event in rest if event["event"] == "command"]
+    assert (commands[-1]["velocity"], commands[-1]["valid_for"]) == ([0.0, 0.0], 0.5)
+    assert {event["line"] for event in [*events, *rest] if event["event"] == "rejected"} == {"what is this", '{"position": [3, NaN]}'}
     np.testing.assert_allclose(events[-1]["velocity"], [-0.3, -0.4], atol=0.02)  # towards the disc, no faster than allowed

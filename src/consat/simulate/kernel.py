@@ -280,7 +280,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         if awake is not None:
             heard = _where_awake(_BODIES, world, awake, heard, now.heard)
     per_copy = jax.tree.leaves((message if protocol.speaks == "link" else (), () if word is None else (word.position, word.stale)))
-    floats = sent * (1 if word is None else 2) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
+    floats = (sent if word is None else 2 * sent) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
     if protocol.speaks == "pair" and everyone.interior is not None:
         talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
         reached = talks if reached is None else talks & reached
