@@ -26,6 +26,7 @@ ME = "änn"
 INF = math.inf
 EXPECTED: dict[str, dict[Kind, list[Any]]] = {
     "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)]},
+    "carol": {Kind.STATE: [Numbers((2, 6), (9.0, 9.0, INF, 100.0, 100.0, 1e6))]},  # as of estimates, a margin, a body, and its age
     "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)]},
 }
 WINDOW = {Reason.DUPLICATE, Reason.STALE, Reason.JUMP}
@@ -107,7 +108,8 @@ def _arrays(data: bytes, count: int, expected: list[Any]) -> list[tuple[tuple[in
     values = [_double(data[at : at + 8]) for at in range(9 * count, len(data), 8)]
     arrays = []
     for array, size in zip(wanted, sizes, strict=True):
-        if not all(abs(value) <= array.largest for value in values[:size]):
+        limits = array.largest if isinstance(array.largest, tuple) else (array.largest,)
+        if not all(abs(value) <= limits[place % len(limits)] for place, value in enumerate(values[:size])):
             return None
         arrays.append((array.shape, values[:size]))
         del values[:size]
