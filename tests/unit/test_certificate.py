@@ -158,10 +158,27 @@ def test_concave_constraints_beyond_degree_two() -> None:
 
 
 def test_diverged_positions_prove_nothing() -> None:
-    for value in (np.nan, np.inf, 1e200):
+    for value in (np.nan, np.inf):
         found = bounds(case("c"), np.full((3, 2), value))
         assert found.verdict == "undecided"
         assert found.upper is None
+
+
+def test_where_a_margin_is_no_number_a_bound_from_elsewhere_holds() -> None:
+    for letter, verdict in (("c", "undecided"), ("d", "infeasible")):
+        found = bounds(case(letter), np.full((3, 2), 1e200))
+        assert found.lower == -np.inf
+        assert found.verdict == verdict
+        assert MARGINS[letter] - 1e-5 <= found.upper <= MARGINS[letter] + 0.01
+
+
+def test_no_bound_comes_from_where_a_constraint_ends() -> None:
+    """log(9 − ‖p‖²) is best at 0, and −∞ from 3 on: there it has no tangent."""
+    team = cs.Team([cs.Agent("p", [cs.expr("log(9 - norm2(p))")])])
+    for x in ([0.0, 0.0], [2.9, 0.0], [3.0, 0.0], [50.0, 0.0]):
+        found = bounds(team, np.array([x]))
+        assert found.upper is None or found.upper >= np.log(9) - 1e-9
+    assert bounds(team, np.zeros((1, 2))).upper == pytest.approx(np.log(9))
 
 
 def test_a_grid_is_certified_by_its_multipliers() -> None:

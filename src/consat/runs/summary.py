@@ -11,6 +11,7 @@ import numpy as np
 from consat import __version__
 from consat.central.certificate import bounds
 from consat.objective import Objective, Schedule, weigh
+from consat.runs.advice import warnings_of
 from consat.scale import Scale
 from consat.scenario import Scenario
 from consat.settings import Settings
@@ -63,6 +64,9 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "clusters": _clusters(team, trace.cluster) if listed else None,
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
+        "warnings": warnings_of(
+            team, trace, schedule.at(float(trace.steps[-1])) if trace.clock == "time" else nu, size, str(settings.protocol.kind)
+        ),
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
     }
@@ -88,13 +92,12 @@ def status_of(ending: str, margin: float, upper: float | None, psi: float) -> st
 
 def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray, violated: np.ndarray | None) -> Mapping[str, Any]:
     violated = np.full(len(margins), np.nan) if violated is None else violated
-    agents: dict[str, Any] = {agent: {"margin": None, "constraints": []} for agent in team.ids}
+    least = np.full(team.count, np.inf)
+    np.minimum.at(least, team.owner, margins)
+    agents: dict[str, Any] = {agent: {"margin": number(value), "constraints": []} for agent, value in zip(team.ids, least, strict=True)}
     for owner, name, margin, multiplier, share in zip(team.owner, team.names, margins, multipliers, violated, strict=True):
-        agent = agents[team.ids[owner]]
-        value = number(margin)
-        told = {"name": name, "margin": value, "multiplier": number(multiplier), "violated_share": number(share)}
-        agent["constraints"].append(told)
-        agent["margin"] = value if agent["margin"] is None or value is None else min(agent["margin"], value)
+        told = {"name": name, "margin": number(margin), "multiplier": number(multiplier), "violated_share": number(share)}
+        agents[team.ids[owner]]["constraints"].append(told)
     return agents
 
 

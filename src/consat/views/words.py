@@ -39,7 +39,12 @@ def summary(summary: Mapping[str, Any]) -> str:
     """A summary, as ``consat run --json`` prints it, as text for people."""
     status, ending = STATUS[summary["status"]], ENDING.get(summary.get("ending", ""))
     lines = [f"{summary['scenario']}: {status}" + (f"; {ending}" if ending and summary["status"] != "diverged" else "")]
-    for name, value in (*_outcome(summary), *_effort(summary), *_who(summary)):
+    for name, value in (
+        *_outcome(summary),
+        *_effort(summary),
+        *_who(summary),
+        *(("warning", text) for text in summary.get("warnings", ())),
+    ):
         lines.append(f"  {name:<16}{value}")
     return "\n".join(lines)
 

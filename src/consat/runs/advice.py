@@ -1,0 +1,104 @@
+"""What of a run its user should be warned of, and what would help, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consat.central.quadratics import Floats, values_and_gradients
+from consat.objective import Nu
+from consat.protocols import FLOWS, ROUNDS
+from consat.scale import Scale
+from consat.solver import FLAT
+from consat.teams.team import Team
+from consat.trace import Trace
+
+NAMED = 3
+"""So many agents are named in a warning; of more, their number is told."""
+ROUNDS_HELP = next(iter(ROUNDS))
+
+
+def warnings_of(team: Team, trace: Trace, nu: Nu, size: Scale, protocol: str) -> list[str]:
+    """Sentences, none where nothing is to be warned of.
+
+    Args:
+        team: the team.
+        trace: of the run.
+        nu: ν at its end.
+        size: the team's natural size.
+        protocol: its name.
+    """
+    found = []
+    if protocol in FLOWS and trace.ending in ("diverged", "too stiff"):
+        found.append(_flow(trace, nu))
+    if np.isfinite(trace.end).all():
+        found += _positions(team, trace.end, nu, size)
+    return found
+
+
+def _flow(trace: Trace, nu: Nu) -> str:
+    alpha, beta = float(nu.alpha), float(nu.beta)
+    went = "diverged" if trace.ending == "diverged" else "became too stiff to follow"
+    smaller = f"'smoothing={{nu_alpha: {alpha / 10:.2g}, nu_beta: {beta / 10:.2g}}}'"
+    ramp = f"'smoothing={{nu_alpha: {alpha:.3g}, nu_beta: {{from: {beta / 500:.2g}, to: {beta:.3g}, rate: {beta / 227:.2g}}}}}'"
+    return (
+        f"The flow {went} at t = {trace.steps[-1]:.4g} s: f = exp(-nu psi) is too large there, or bends too much. What would help: a "
+        f"smaller nu (--set {smaller}), a ramp of nu_beta (--set {ramp}), or a protocol in rounds (--protocol {ROUNDS_HELP}), which takes any start."
+    )
+
+
+def _positions(team: Team, x: Floats, nu: Nu, size: Scale) -> list[str]:
+    """Of agents whose constraints are violated and do not say where to go."""
+    values, gradients = values_and_gradients(team, x)
+    margins = np.full(team.count, np.inf)
+    np.minimum.at(margins, team.owner, values)
+    worst = np.flatnonzero((values <= margins[team.owner]) & (values <= 0))
+    if not len(worst):
+        return []
+    ended = worst[values[worst] == -np.inf]
+    flat = worst[
+        (values[worst] > -np.inf) & (_slopes(team, values, gradients, margins, nu)[team.owner[worst]] * nu.alpha * size.length < FLAT)
+    ]
+    start = "(start: of an agent, or --set start.box=[LOW,HIGH])"
+    found = []
+    if len(ended):
+        found.append(
+            f"{_named(team, ended)} no finite number at the end, which counts as violated beyond measure. What would help: a start where "
+            f"it is one {start}, or another constraint that keeps its agents there."
+        )
+    if len(flat):
+        found.append(
+            f"{_named(team, flat)} violated and flat at the end (a plateau): no small move changes it, so that there is nothing to climb. "
+            f"What would help: a start nearer to where it holds {start}, or a psi that keeps its slope, such as 4 - norm2(p) in place of "
+            "tanh(4 - norm2(p))."
+        )
+    return found
+
+
+def _slopes(team: Team, values: Floats, gradients: list[Floats], margins: Floats, nu: Nu) -> Floats:
+    """(N,) the largest entry of ∇α_i, over all positions that agent i reads; of agents whose constraints are violated."""
+    bad = (margins <= 0) & (margins > -np.inf)
+    base = np.where(bad, margins, 0.0)[team.owner]
+    share = np.where(bad[team.owner], np.exp(np.minimum(-float(nu.alpha) * (values - base), 0.0)), 0.0)
+    total = np.bincount(team.owner, share, minlength=team.count)
+    share = share / np.where(total > 0, total, 1.0)[team.owner]
+    keys, entries = [], []
+    for family, gradient in zip(team.families, gradients, strict=True):
+        members = bad[family.owner]
+        keys.append((family.owner[members, None].astype(np.int64) * team.count + family.agents[members]).ravel())
+        weighted = share[family.number][members, None, None] * np.nan_to_num(gradient[members])
+        entries.append(weighted.reshape(-1, team.dimension))
+    found, place = np.unique(np.concatenate(keys), return_inverse=True)
+    added = np.zeros((len(found), team.dimension))
+    np.add.at(added, place, np.concatenate(entries))
+    slopes = np.zeros(team.count)
+    np.maximum.at(slopes, found // team.count, np.abs(added).max(axis=1))
+    return slopes
+
+
+def _named(team: Team, constraints: np.ndarray) -> str:
+    """``psi of a1's tether is`` …"""
+    some = [f"{team.ids[int(team.owner[k])]}'s {team.names[int(k)]}" for k in constraints[:NAMED]]
+    more = [] if len(constraints) <= NAMED else [f"{len(constraints) - NAMED} more"]
+    listed = [*some, *more]
+    whole = listed[0] if len(listed) == 1 else f"{', '.join(listed[:-1])} and {listed[-1]}"
+    return f"psi of {whole} {'is' if len(listed) == 1 else 'are'}"
