@@ -42,7 +42,8 @@ def _flow(trace: Trace, nu: Nu) -> str:
     ramp = f"'smoothing={{nu_alpha: {alpha:.3g}, nu_beta: {{from: {beta / 500:.2g}, to: {beta:.3g}, rate: {beta / 227:.2g}}}}}'"
     return (
         f"The flow {went} at t = {trace.steps[-1]:.4g} s: f = exp(-nu psi) is too large there, or bends too much. What would help: a "
-        f"smaller nu (--set {smaller}), a ramp of nu_beta (--set {ramp}), or a protocol in rounds (--protocol {ROUNDS_HELP}), which takes any start."
+        f"smaller nu (--set {smaller}), a ramp of nu_beta (--set {ramp}), or "
+        f"a protocol in rounds (--protocol {ROUNDS_HELP}), which takes any start."
     )
 
 
