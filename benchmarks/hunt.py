@@ -20,6 +20,7 @@ SciPy is the independent optimiser: BFGS on a soft minimum of ψ, which NumPy ev
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import tempfile
 import time
@@ -28,6 +29,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from types import CodeType
 from typing import Any
 
 import jax.numpy as jnp
@@ -63,6 +65,11 @@ NUMPY, JAX = _names(np), _names(jnp)
 CALLABLES_ONLY = ("largest", "total", "maximum", "minimum", "absolute")
 
 
+@functools.lru_cache(maxsize=1000)
+def _compiled(text: str) -> CodeType:
+    return compile(text, "psi", "eval")
+
+
 @dataclass(frozen=True)
 class Psi:
     """A ψ: its text, whose positions it reads, and how it is given: ``text``, ``function``, or ``parameters``."""
@@ -74,13 +81,13 @@ class Psi:
     def value(self, at: dict[str, np.ndarray]) -> float:
         """By NumPy alone; −∞ where it is no finite number."""
         with np.errstate(all="ignore"):
-            value = float(eval(self.text, {"__builtins__": {}}, NUMPY | {name: at[name] for name in self.reads}))  # noqa: S307
+            value = float(eval(_compiled(self.text), {"__builtins__": {}}, NUMPY | {name: at[name] for name in self.reads}))  # noqa: S307
         return value if np.isfinite(value) else -np.inf
 
     def constraint(self) -> cs.Constraint:
         if self.form == "text":
             return cs.expr(self.text)
-        code = compile(self.text, "psi", "eval")
+        code = _compiled(self.text)
 
         def psi(*positions: Any, **parameters: Any) -> Any:
             value = eval(code, {"__builtins__": {}}, JAX | dict(zip(self.reads, positions, strict=True)))  # noqa: S307
@@ -126,10 +133,6 @@ class Case:
                     x = minimize(self.soft, x, args=(nu,), method="BFGS", options={"maxiter": 200}).x
             margins.append(self.margin(x.reshape(len(self.agents), -1)))
         return max(margins) if sum(margin > 1e-3 for margin in margins) >= 2 else None
-
-    def best(self) -> float:
-        """The best margin that SciPy finds at all."""
-        return self.easy() or -np.inf
 
 
 def draw(seed: int) -> Case:

@@ -54,10 +54,11 @@ DRAWS = 4
 
 
 class Place(NamedTuple):
-    """Where a search for first estimates stands: how many tries were made, and the estimates, (rows, d)."""
+    """Where a search for first estimates stands: the number of the try, the estimates, (rows, d), and who is lost there, (N,)."""
 
     number: Array
     x: Array
+    lost: Array
 
 
 @dataclass(frozen=True)
@@ -96,15 +97,16 @@ class Footing:
             return x
         tries, moved = Tries.all(), self.moves(x)
 
-        def improve(at: Place) -> Place:
-            lost = pick(self.lost(at.x), self.holder)[:, None]
-            return Place(at.number + 1, jnp.where(lost, x + moved(at.number, jax.tree.map(lambda each: each[at.number], tries)), at.x))
+        def improve(at: Place) -> Place:  # the first try is none, so that ψ is looked at in one place of the program
+            step = moved(at.number, jax.tree.map(lambda each: each[at.number - 1], tries))
+            candidate = jnp.where(pick(at.lost, self.holder)[:, None] & (at.number > 0), x + step, at.x)
+            return Place(at.number + 1, candidate, self.lost(candidate))
 
         def goes_on(at: Place) -> Array:
-            return (at.number < len(tries.own)) & jnp.any(self.lost(at.x))
+            return (at.number <= len(tries.own)) & jnp.any(at.lost)
 
-        found = jax.lax.while_loop(goes_on, improve, Place(jnp.asarray(0), x)).x
-        return jnp.where(pick(self.lost(found), self.holder)[:, None], x, found)
+        found = jax.lax.while_loop(goes_on, improve, Place(jnp.asarray(0), x, jnp.ones(len(self.own), bool)))
+        return jnp.where(pick(found.lost, self.holder)[:, None], x, found.x)
 
     def moves(self, x: Array) -> Callable[[Array, Tries], Array]:
         """The step, (rows, d), of a try with its number. What is drawn for a copy hangs on its rank among those of its holder, not on who

@@ -28,8 +28,8 @@ UNSEARCHED = 2
 """Steps of a chunk that go without a line search."""
 SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
 """Parts of a step that a line search tries."""
-SHORTEST = 12
-"""How often a step that would leave the domain of a ψ is divided by four before it is given up."""
+SHORT = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
+"""What else it tries where a ψ may end on the way."""
 
 
 class Guess(NamedTuple):
@@ -165,30 +165,11 @@ class _Task(NamedTuple):
     def start(self, guess: Guess) -> _Search:
         count = self.v.shape[1]
         infinity = jnp.full(count, jnp.inf, self.v.dtype)
-        y, done = guess.y.reshape(self.v.shape), jnp.zeros(count, bool)
-        if self.lanes.batch.partial:  # who is outside follows v, and begins there if that is inside
-            y = jnp.where(self.inside(y)[None], y, self.v)
-            done = ~self.inside(y)
-        nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int)
-        return _Search(y, guess.sigma, guess.sharpness, -infinity, infinity, *nothing, done)
-
-    def inside(self, y: Array) -> Array:
-        """(A,) whether every ψ is a number at y, (N, A), that can be computed with."""
-        return ~self.lanes.outside(self.lanes.violations(y.reshape(*self.shape, -1)))
-
-    def shortened(self, y: Array, to: Array) -> Array:
-        """(N, A) `to`, or where it lies outside what is nearer to y; y at last. Where a ψ ends, a step ends."""
-        if not self.lanes.batch.partial:
-            return to
-
-        def shorten(at: tuple[Array, Array]) -> tuple[Array, Array]:
-            number, step = at
-            return number + 1, jnp.where(self.inside(y + step)[None], step, jnp.where(number < SHORTEST, 0.25 * step, 0.0))
-
-        def goes_on(at: tuple[Array, Array]) -> Array:
-            return (at[0] <= SHORTEST) & ~jnp.all(self.inside(y + at[1]))
-
-        return y + jax.lax.while_loop(goes_on, shorten, (jnp.asarray(0), to - y))[1]
+        y = guess.y.reshape(self.v.shape)
+        if self.lanes.batch.partial:  # who is outside begins at v
+            y = jnp.where(self.lanes.outside(self.lanes.violations(guess.y))[None], self.v, y)
+        nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int), jnp.zeros(count, bool)
+        return _Search(y, guess.sigma, guess.sharpness, -infinity, infinity, *nothing)
 
     def found(self, at: _Search) -> Found:
         return Found(Guess(at.y.reshape(*self.shape, -1), at.sigma, at.sharpness), at.stiffness, at.iterations, at.done)
@@ -203,9 +184,6 @@ class _Task(NamedTuple):
         gap, ceiling = model.level - sigma, here.ceiling
 
         # y alone, for this multiplier, until that much is settled to a fraction of the gap …
-        alone = jax.lax.cond(
-            jnp.any(~near & ~at.done), lambda: self.search(at, multiplier, ahead.descend), lambda: at.y + ahead.descend
-        )  # fmt: skip
         # … then both at once, σ within a bracket that only certain signs may narrow
         drop = dot(model.slope, ahead.descend)
         certain = near & (jnp.abs(drop) <= 0.3 * jnp.abs(gap))
@@ -214,8 +192,14 @@ class _Task(NamedTuple):
         wanted = here.wanted(drop)
         bracketed = jnp.isfinite(low) & jnp.isfinite(high) & ((wanted < low) | (wanted > high))
         wanted = jnp.minimum(jnp.where(bracketed, 0.5 * (low + high), wanted), ceiling)
-        together = at.y + ahead.to(wanted - sigma)
-        to = self.shortened(at.y, jnp.where(near[None], together, alone))
+        together = ahead.to(wanted - sigma)
+        if self.lanes.batch.partial:
+            to = self.search_within(at, multiplier, jnp.where(near[None], together, ahead.descend), near)
+        else:
+            alone = jax.lax.cond(
+                jnp.any(~near & ~at.done), lambda: self.search(at, multiplier, ahead.descend), lambda: at.y + ahead.descend
+            )  # fmt: skip
+            to = jnp.where(near[None], at.y + together, alone)
 
         sharp = at.sharpness >= 1.0
         met = (sigma >= ceiling - 1e-6) & (gap > 0)
@@ -227,10 +211,12 @@ class _Task(NamedTuple):
         sharpen = near & ((jnp.abs(gap) <= 3.0) | met) & ~sharp
         moves, rises = ~done, near & ~done
         tired = at.iterations + 1 >= MOST_ITERATIONS
+        if self.lanes.batch.partial:  # outside there is nothing to be solved
+            tired |= model.level == jnp.inf
         return _Search(
             y=jnp.where(moves[None], to, at.y),
             sigma=jnp.where(rises, wanted, jnp.where(at.done, at.sigma, sigma)),
-            sharpness=jnp.where(sharpen & moves, self.sharper(at, to), at.sharpness),
+            sharpness=jnp.where(sharpen & moves, self.sharper(at.sharpness), at.sharpness),
             low=jnp.where(sharpen, -jnp.inf, low),
             high=jnp.where(sharpen, jnp.inf, high),
             stiffness=jnp.where(at.done[None], at.stiffness, self.stiffness(here)),
@@ -238,12 +224,10 @@ class _Task(NamedTuple):
             done=done | last | tired,
         )
 
-    def sharper(self, at: _Search, y: Array) -> Array:
-        """(A,) the next sharpness, at y."""
-        sharper = SHARPEN * at.sharpness
-        if self.lanes.batch.partial:  # it was next to nothing where some ψ was steep, and need not be here
-            sharper = jnp.maximum(sharper, self.lanes.bluntest(self.lanes.violations(y.reshape(*self.shape, -1))))
-        return jnp.minimum(sharper, 1.0)
+    def sharper(self, sharpness: Array) -> Array:
+        """(A,) the next sharpness; where some ψ was so steep that it is next to nothing, it rises faster."""
+        next_ = SHARPEN * sharpness
+        return jnp.minimum(jnp.maximum(next_, jnp.sqrt(sharpness)) if self.lanes.batch.partial else next_, 1.0)
 
     def plain_step(self, at: _Search) -> _Search:
         """A step of Newton in every lane that is not done, and the last of those that begin it within reach of the solution; y alone moves
@@ -300,6 +284,20 @@ class _Task(NamedTuple):
         worths = jax.vmap(worth)(scales)
         best = jnp.argmin(jnp.where(jnp.isnan(worths), jnp.inf, worths), axis=0)
         return at.y + scales[best][None] * descend
+
+    def search_within(self, at: _Search, multiplier: Array, step: Array, near: Array) -> Array:
+        """(N, A) as `search`, for ψ that end somewhere, where a step ends; who is near the solution only keeps inside."""
+
+        def level(scale: Array) -> tuple[Array, Array]:
+            y = at.y + scale * step
+            level = self.level(y, at.sharpness)
+            worth = 0.5 * add_up(self.kappa * (y - self.v) ** 2) + multiplier * level
+            return level < jnp.inf, jnp.where(worth < jnp.inf, worth, jnp.inf)
+
+        scales = jnp.array((*SCALES, *SHORT, 0.0))
+        inside, worths = jax.vmap(level)(scales)
+        best = jnp.where(near, jnp.argmax(inside, axis=0), jnp.argmin(worths, axis=0))
+        return at.y + scales[best][None] * step
 
     def settled(self, at: _Search, here: _Here) -> tuple[Array, Array]:
         """(A,) whether the first equation holds, and whether the second does, as far as float64 can tell."""
