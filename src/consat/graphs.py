@@ -156,7 +156,7 @@ def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarr
 
 
 def middles(count: int, links: np.ndarray) -> np.ndarray:
-    """(K,) for each component an agent from which no other is far: the middle of a longest path, which is exact on trees and close elsewhere.
+    """(K,) for each component an agent from which no other is far: the middle of a longest path; exact on trees and close elsewhere.
 
     Args:
         count: N.

@@ -1,8 +1,8 @@
 """Which variables an agent has in the interior-point protocol, and which of them it shares with which neighbour.
 
-An agent's variables are the positions of which it holds copies, and its level. A position travels along a tree: its holders, joined by links
-between them. The level travels along a spanning tree of each cluster. So what comes from a neighbour about a variable never comes back
-to it through others, unless several variables go round a loop together; where all links in use form a tree, nothing does.
+An agent's variables are the positions of which it holds copies, and its level. A position travels along a tree: its holders, joined by
+links between them. The level travels along a spanning tree of each cluster. So what comes from a neighbour about a variable never comes
+back to it through others, unless several variables go round a loop together; where all links in use form a tree, nothing does.
 """
 
 from __future__ import annotations
@@ -298,9 +298,9 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
         kept.append(form)
         members.append(np.where(used, offset + index, start[-1]).astype(np.int32))
     stacked = np.concatenate([np.zeros((0, A), dtype=np.int32), *members])
-    return Batch(
-        *(jnp.asarray(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)), tuple(kinds), tuple(kept)
-    )
+    arrays = [jnp.asarray(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
+    return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept))
+
 
 
 def _form(family: Family, dimension: int) -> Form:

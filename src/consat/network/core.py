@@ -231,7 +231,7 @@ class _Outline:
 
     def __init__(self, solver: Alone) -> None:
         self.links, self.length, self.hops, self.convex = solver.links, solver.length, solver.hops, solver.convex
-        self.to_rows, self.least = solver.to_rows, solver.least
+        self.to_rows, self.least, self.interior = solver.to_rows, solver.least, solver.interior
 
     def nearby(self, x: Array) -> Array:
         return x

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.interior import Gains, Mail, Memory
+from consat.interior import Gains, Interior, Mail, Memory
 from consat.protocols.base import Known, Solver
 
 
@@ -93,10 +93,11 @@ class InteriorPoint:
         return solver.hops
 
     def start(self, x: Array, solver: Solver) -> InteriorState:
-        return InteriorState(solver.interior.begin(solver.nearby(x), self.gains), solver.interior.silence())
+        interior = _own(solver)
+        return InteriorState(interior.begin(solver.nearby(x), self.gains), interior.silence())
 
     def speak(self, state: InteriorState, solver: Solver, round_: Array, known: Known) -> tuple[InteriorState, Mail]:
-        memory, mail = solver.interior.round(state.memory, state.inbox, known.margin, self.gains)
+        memory, mail = _own(solver).round(state.memory, state.inbox, known.margin, self.gains)
         return InteriorState(memory, state.inbox), mail
 
     def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Solver) -> InteriorState:
@@ -107,7 +108,13 @@ class InteriorPoint:
 
     def proven(self, state: InteriorState, solver: Solver, margin: Array) -> tuple[Array, Array]:
         """What each agent knows of the whole team: (N,) a bound on its best margin, and (N,) the margin it has; `margin`: (N,) own."""
-        return state.memory.bound * solver.interior.units.psi, solver.interior.least(state.inbox, margin)
+        interior = _own(solver)
+        return state.memory.bound * interior.units.psi, interior.least(state.inbox, margin)
+
+
+def _own(solver: Solver) -> Interior:
+    assert solver.interior is not None, "of a protocol that speaks to pairs"
+    return solver.interior
 
 
 NEARLY, EXACTLY = 0.05, 1e-3
