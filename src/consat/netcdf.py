@@ -17,6 +17,7 @@ VARIABLES: Mapping[str, tuple[tuple[str, ...], Mapping[str, str]]] = {
     "velocity": (("agent", "axis"), {"units": "length/s", "long_name": "velocity command u_i"}),
     "margin": ((), {"long_name": "margin β̄, the smallest ψ of the team"}),
     "smooth_margin": ((), {"long_name": "smooth margin β"}),
+    "bound": ((), {"long_name": "bound on the best margin, proven by all agents"}),
     "agent_margin": (("agent",), {"long_name": "agent margin ᾱ_i"}),
     "estimate": (("copy", "axis"), {"long_name": "estimate x_j^(i)"}),
     "integral": (("copy", "axis"), {"long_name": "integral state z_i"}),

@@ -150,11 +150,11 @@ def labels(
     return found
 
 
-def variables(named: Mapping[str, np.ndarray], *, integral: bool) -> list[str]:
+def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool) -> list[str]:
     """What is recorded, of people with these `labels`."""
     of_agents = ["position", "velocity", "agent_margin"] if "agent" in named else []
     of_copies = ["estimate", *(["integral"] if integral else [])] if "holder" in named else []
-    return ["margin", "smooth_margin", *of_agents, *of_copies]
+    return ["margin", "smooth_margin", *(["bound"] if bound else []), *of_agents, *of_copies]
 
 
 def attributes(summary: Mapping[str, Any], scenario: str | None) -> dict[str, Any]:
@@ -174,7 +174,7 @@ def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str 
     data = xr.Dataset(
         {
             name: ((clock, *VARIABLES[name][0]), getattr(trace, name), VARIABLES[name][1])
-            for name in variables(named, integral=trace.integral is not None)
+            for name in variables(named, integral=trace.integral is not None, bound=trace.bound is not None)
         },
         coords={
             clock: (clock, trace.steps, {"units": UNITS[clock]}),

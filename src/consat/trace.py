@@ -27,6 +27,7 @@ class Trace:
         agent_margin: (T, N) ᾱ_i.
         estimate: (T, C, d) all copies, or None where not recorded.
         integral: (T, C, d) the integral states, or None.
+        bound: (T,) on the best margin, proven by all agents, NaN where none is; None where nobody proves any.
         holder: (C,) who holds each copy.
         held: (C,) whose position it is.
         cluster: (N,) cluster of each agent.
@@ -69,6 +70,7 @@ class Trace:
     final: np.ndarray | None = None
     violated: np.ndarray | None = None
     file: Path | None = None
+    bound: np.ndarray | None = None
 
     @property
     def end(self) -> np.ndarray:

@@ -163,6 +163,7 @@ class ManyProcesses:
             margin=margin.min(axis=0),
             smooth_margin=-np.logaddexp.reduce(-nu * smooth, axis=0) / nu,
             known=(known.min(axis=0) > 0).astype(np.int64),
+            bound=np.full(CHUNK, np.nan),
             near=0,
             messages=messages.sum(axis=0).astype(np.int64),
             floats=floats.sum(axis=0).astype(np.int64),
@@ -294,7 +295,7 @@ def _compiled() -> _Programs:
     def hear_(protocol: Rounds, world: World, spoken: Spoken, heard: tuple[Array, Array], noted: tuple[_Book, Array, Array]) -> Any:
         came, into = heard
         packed = _packed(spoken).at[into.reshape(-1)].set(came.reshape(-1, came.shape[-1]), mode="drop")
-        now, known = hear(protocol, world, _with(spoken, packed))
+        now, (known, _) = hear(protocol, world, _with(spoken, packed))
         book, rows, place = noted
         counts = {"known": known, "messages": spoken.messages, "floats": spoken.floats}
         book = book._replace(**{name: getattr(book, name).at[place].set(value.astype(float)) for name, value in counts.items()})

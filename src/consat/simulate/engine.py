@@ -26,7 +26,7 @@ SURE = 3
 """For so many rounds on end all must know what ends a run: what they have heard of the others' margins is some rounds old."""
 NEVER = 2**62
 """More rounds than there are."""
-SCALARS = ("margin", "smooth_margin", "known", "messages", "floats")
+SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats")
 """Of what is seen of a round, the numbers that every chunk tells."""
 
 
@@ -52,6 +52,7 @@ class Chunk(NamedTuple):
         margin: (CHUNK,) β̄ after each.
         smooth_margin: (CHUNK,).
         known: (CHUNK,) what everybody knew; see `consat.simulate.kernel.knowledge`.
+        bound: (CHUNK,) on the best margin, proven by all; NaN where none is.
         near: for how many rounds everybody has known what ends the run.
         messages: (CHUNK,) sent.
         floats: (CHUNK,) sent.
@@ -64,6 +65,7 @@ class Chunk(NamedTuple):
     margin: Any
     smooth_margin: Any
     known: Any
+    bound: Any
     near: Any
     messages: Any
     floats: Any
@@ -177,6 +179,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         margin=jnp.zeros(CHUNK, real),
         smooth_margin=jnp.zeros(CHUNK, real),
         known=jnp.zeros(CHUNK, whole),
+        bound=jnp.zeros(CHUNK, real),
         near=ask.near,
         messages=jnp.zeros(CHUNK, whole),
         floats=jnp.zeros(CHUNK, whole),
@@ -219,7 +222,7 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
 
 def _look(world: World, chosen: Chosen, now: Now) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world, now.state.x, now.body, nothing, nothing, nothing))
+    return chosen.of_seen(see(world, now.state.x, now.body, nothing, nothing, nothing, nothing))
 
 
 @functools.cache

@@ -142,6 +142,7 @@ class Seen(NamedTuple):
     agent_margin: Any
     estimate: Any
     known: Any
+    bound: Any
     messages: Any
     floats: Any
 
@@ -250,7 +251,7 @@ def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[
     """What all agents do in one round."""
     spoken = speak(protocol, world, now, round_)
     now, known = hear(protocol, world, spoken)
-    return now, see(world, now.state.x, now.body, known, spoken.messages, spoken.floats)
+    return now, see(world, now.state.x, now.body, *known, spoken.messages, spoken.floats)
 
 
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
@@ -304,8 +305,8 @@ def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
     return key, awake >= world.sleep, through >= world.loss
 
 
-def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, Array]:
-    """The second half of a round; tells also whether everybody knows that all are satisfied."""
+def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Array, Array]]:
+    """The second half of a round; tells also what all know, see `knowledge`."""
     everyone, ends = world.everyone, world.everyone.links
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
     message, told, word = spoken.crossing
@@ -328,12 +329,13 @@ SATISFIED, INFEASIBLE, NEAR, BEST = 1, 2, 4, 8
 best, or the best to `EXACTLY`."""
 
 
-def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Array:
-    """What all agents know, of `SATISFIED` and the others; `satisfied`: (N,) who knows that all are."""
+def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> tuple[Array, Array]:
+    """What all agents know, of `SATISFIED` and the others, and the bound on the best margin that all have proven, NaN where none is;
+    `satisfied`: (N,) who knows that all are."""
     everyone = world.everyone
     known = jnp.where(jnp.all(satisfied), SATISFIED, 0)
     if not isinstance(protocol, InteriorPoint) or everyone.interior is None:
-        return known
+        return known, jnp.asarray(jnp.nan)
     margin = everyone.margin(now.state.x if now.heard is None else now.heard.position)
     bound, least = protocol.proven(now.state, everyone, margin)
     gap, unit = bound - least, everyone.interior.units.psi
@@ -344,7 +346,8 @@ def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> Arr
     some = jnp.any(torn)
     known += jnp.where(jnp.all(satisfied | torn | idle) & some, INFEASIBLE, 0)
     known += jnp.where(jnp.all(satisfied | (torn & near(bound, least, unit)) | idle) & some, NEAR, 0)
-    return known + jnp.where(jnp.all(best | idle), BEST, 0)
+    most = jnp.max(jnp.where(idle, -jnp.inf, bound), initial=-jnp.inf)
+    return known + jnp.where(jnp.all(best | idle), BEST, 0), jnp.where(jnp.isfinite(most), most, jnp.nan)
 
 
 def _moved(body: Array, target: Array, reach: Array | None) -> Array:
@@ -355,11 +358,11 @@ def _moved(body: Array, target: Array, reach: Array | None) -> Array:
     return jnp.where(distance > reach, body + away * (reach / jnp.where(distance > 0, distance, 1.0)), target)
 
 
-def see(world: World, x: Array, body: Array, known: Array, messages: Array, floats: Array) -> Seen:
+def see(world: World, x: Array, body: Array, known: Array, bound: Array, messages: Array, floats: Array) -> Seen:
     """What an observer sees of estimates x and positions `body`."""
     margins = world.observer.agent_margins(body)
     smooth = world.observer.smooth_margin(body, world.everyone.nu)
-    return Seen(body, jnp.min(margins), smooth, margins, x, known, messages, floats)
+    return Seen(body, jnp.min(margins), smooth, margins, x, known, bound, messages, floats)
 
 
 def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
@@ -393,7 +396,7 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
     start = first[world.own]
     heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
     now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
-    return now, see(world, first, start, jnp.asarray(0), jnp.asarray(0), jnp.asarray(0))
+    return now, see(world, first, start, jnp.asarray(0), jnp.asarray(jnp.nan), jnp.asarray(0), jnp.asarray(0))
 
 
 def precision_for(count: int) -> prox.Precision:

@@ -127,6 +127,7 @@ def follow(
         agent_margin=rows.agent_margin,
         estimate=rows.estimate,
         integral=rows.integral,
+        bound=rows.bound,
         holder=copies.holder[held],
         held=copies.position[held],
         cluster=copies.cluster,

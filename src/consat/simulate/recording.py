@@ -44,6 +44,7 @@ class Rows(NamedTuple):
         agent_margin: (K, R).
         estimate: (K, E, d), or None.
         integral: (K, E, d), or None.
+        bound: (K,) on the best margin, proven by all agents, NaN where none is; None in continuous time.
     """
 
     step: Any
@@ -54,6 +55,7 @@ class Rows(NamedTuple):
     agent_margin: Any
     estimate: Any
     integral: Any
+    bound: Any = None
 
     def where(self, chosen: np.ndarray) -> Rows:
         """Some of the steps."""

@@ -53,6 +53,7 @@ class Tally(Steps):
         messages: sent.
         floats: sent.
         smooth_margin: the last.
+        bound: the last.
         asked: the round at which it was last asked whether there is hope.
         violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
     """
@@ -64,6 +65,7 @@ class Tally(Steps):
     messages: int = 0
     floats: int = 0
     smooth_margin: float = np.nan
+    bound: float = np.nan
     asked: int = 0
     known: int = 0
     infeasible_from: int | None = None
@@ -86,7 +88,7 @@ class Tally(Steps):
         self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
         self.violated = None if chunk.violated is None else np.asarray(self.violated) + np.asarray(chunk.violated)
         self.done += count
-        self.margin, self.smooth_margin = float(margin[-1]), float(chunk.smooth_margin[count - 1])
+        self.margin, self.smooth_margin, self.bound = (float(leaf[count - 1]) for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound))
         self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
         return numbers
 
@@ -234,15 +236,16 @@ class _Course:
         numbers = self.tally.add(chunk)
         chosen = np.flatnonzero(numbers % every == 0)
         kept = Kept(*(np.asarray(leaf)[: len(chosen)] for leaf in chunk.kept))
-        return self._rows(numbers[chosen], np.asarray(chunk.margin)[chosen], np.asarray(chunk.smooth_margin)[chosen], kept)
+        return self._rows(numbers[chosen], *(np.asarray(leaf)[chosen] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound)), kept)
 
     def look(self, state: Any) -> Rows:
-        step, margin, smooth = (np.array([number]) for number in (self.tally.done, self.tally.margin, self.tally.smooth_margin))
-        return self._rows(step, margin, smooth, Kept(*(leaf[None] for leaf in self._engine.look(state))))
+        tally = self.tally
+        last = (np.array([number]) for number in (tally.done, tally.margin, tally.smooth_margin, tally.bound))
+        return self._rows(*last, Kept(*(leaf[None] for leaf in self._engine.look(state))))
 
-    def _rows(self, step: np.ndarray, margin: np.ndarray, smooth_margin: np.ndarray, kept: Kept) -> Rows:
+    def _rows(self, step: np.ndarray, margin: np.ndarray, smooth_margin: np.ndarray, bound: np.ndarray, kept: Kept) -> Rows:
         estimate = None if self._choice.copies is None else kept.estimate
-        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None)
+        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound)
 
     def told(self, rows: Rows) -> Mapping[str, Any]:
         tally = self.tally

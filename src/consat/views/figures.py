@@ -171,6 +171,9 @@ def margins(result: Result) -> Figure:
         curve = data[name].where(np.isfinite(data[name]))
         dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
         axes.plot(data[clock], curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
+    if "bound" in data and np.isfinite(data["bound"].values).any():
+        proven = data["bound"].where(np.isfinite(data["bound"]))
+        axes.plot(data[clock], proven, color=COLOURS[4], linestyle=(0, (1, 1)), linewidth=2.2, label="proven by the team: none is better")
     axes.margins(y=0.08)
     _stretch(axes, data["margin"].values, data["smooth_margin"].values)
     lower, upper = summary.get("bounds") or (None, None)
