@@ -23,6 +23,8 @@ RESULT = "result.nc"
 """The result file in the directory of a run."""
 LARGE = 2**28
 """Bytes of a file beyond which arrays are read only when they are asked for."""
+MOST_EXPLAINED = 200
+"""Agents of a team of which it is said at once what stands in the way; of more, `consat.solve` says it."""
 SLIGHT = 1e-3
 """A constraint with a smaller multiplier does not bind."""
 
@@ -115,7 +117,19 @@ class Result:
     def __str__(self) -> str:
         from consat.views import words
 
-        return words.summary(self.summary)
+        return words.summary(self.summary, self.reasons)
+
+    @functools.cached_property
+    def reasons(self) -> list[str]:
+        """What conflicts in a team that cannot be satisfied, how much is missing, and what would do, as `consat.solve` says it; empty for
+        others, and for teams of more than `MOST_EXPLAINED` agents."""
+        team = self.team if self.summary["verdict"] == "infeasible" else None
+        if team is None or team.count > MOST_EXPLAINED:
+            return []
+        from consat.central.reasons import explain
+        from consat.central.reference import max_min
+
+        return explain(team, max_min(team))
 
     def __repr__(self) -> str:
         return f"<Result of {self.summary['scenario']}: {self.summary['status']}, margin {self.summary['margin']}>"

@@ -302,7 +302,6 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
     return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept))
 
 
-
 def _form(family: Family, dimension: int) -> Form:
     from consat.constraints.curvature import Curvature, read_curvatures
 

@@ -163,19 +163,22 @@ def formation(result: Result, axes: Any = None) -> Figure | None:
 
 
 def margins(result: Result) -> Figure:
-    """The margin β̄ and the smooth margin β, from when on every constraint holds, and between what the best margin is proven to lie."""
+    """The margin β̄, from when on every constraint holds, and between what the best margin is proven to lie; and the bound that the agents
+    themselves have proven, where they do, else the smooth margin β."""
     data, summary = recorded(result), result.summary
     figure, axes, clock = _chart(result, "margin of the team", "margin")
     axes.axhline(0.0, color="black", linewidth=0.8)
-    for name, label, k in (("margin", r"margin $\barβ$", 0), ("smooth_margin", r"smooth margin $β$", 1)):
+    proves = "bound" in data and np.isfinite(data["bound"].values).any()
+    curves = [("margin", r"margin $\barβ$", 0), *([] if proves else [("smooth_margin", r"smooth margin $β$", 1)])]
+    for name, label, k in curves:
         curve = data[name].where(np.isfinite(data[name]))
         dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
         axes.plot(data[clock], curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
-    if "bound" in data and np.isfinite(data["bound"].values).any():
+    if proves:
         proven = data["bound"].where(np.isfinite(data["bound"]))
-        axes.plot(data[clock], proven, color=COLOURS[4], linestyle=(0, (1, 1)), linewidth=2.2, label="proven by the team: none is better")
+        axes.plot(data[clock], proven, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
     axes.margins(y=0.08)
-    _stretch(axes, data["margin"].values, data["smooth_margin"].values)
+    _stretch(axes, *(data[name].values for name, *_ in curves))
     lower, upper = summary.get("bounds") or (None, None)
     if lower is not None and upper is not None:
         proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
@@ -186,7 +189,7 @@ def margins(result: Result) -> Figure:
         label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
         late = since > np.mean(axes.get_xlim())
         axes.text(since, 0.06, f" {label} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 

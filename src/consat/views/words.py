@@ -26,6 +26,10 @@ ENDING = {
     "too stiff": "the run ended early, since the flow became too stiff",
     "interrupted": "the run was interrupted",
 }
+KNOWN = {
+    "satisfied": "each that every constraint holds",
+    "infeasible": "each that the constraints cannot all hold, by a proof of the team's own",
+}
 BEST = "max-min"
 """The protocol that ends at the best margin."""
 VERDICT = {
@@ -35,14 +39,15 @@ VERDICT = {
 }
 
 
-def summary(summary: Mapping[str, Any]) -> str:
-    """A summary, as ``consat run --json`` prints it, as text for people."""
+def summary(summary: Mapping[str, Any], reasons: Sequence[str] = ()) -> str:
+    """A summary, as ``consat run --json`` prints it, as text for people; `reasons` say what stands in the way."""
     status, ending = STATUS[summary["status"]], ENDING.get(summary.get("ending", ""))
     lines = [f"{summary['scenario']}: {status}" + (f"; {ending}" if ending and summary["status"] != "diverged" else "")]
     for name, value in (
         *_outcome(summary),
         *_effort(summary),
         *_who(summary),
+        *(("in the way", text) for text in reasons),
         *(("warning", text) for text in summary.get("warnings", ())),
     ):
         lines.append(f"  {name:<16}{value}")
@@ -73,12 +78,21 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     else:
         yield "satisfied from", "not at the end of the run"
 
+    if summary.get("known"):
+        since = "" if summary.get("known_from") is None else f", from {_when(summary)}"
+        yield "agents know", KNOWN[summary["known"]] + since
+
     way = summary.get("on_the_way")
     if way is not None and way["violated"] and summary["status"] != "diverged":
         yield "on the way", _way(summary, way)
     advice = _advice(summary)
     if advice:
         yield "what to do", advice
+
+
+def _when(summary: Mapping[str, Any]) -> str:
+    since = summary["known_from"]
+    return f"round {since:.0f}" if summary.get("rounds") is not None else f"t = {_number(since)} s"
 
 
 def _way(summary: Mapping[str, Any], way: Mapping[str, Any]) -> str:
