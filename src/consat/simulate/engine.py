@@ -222,7 +222,7 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
 
 def _look(world: World, chosen: Chosen, now: Now) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world, now.state.x, now.body, nothing, nothing, nothing, nothing))
+    return chosen.of_seen(see(world, now.state.x, now.body, (nothing, nothing), (nothing, nothing)))
 
 
 @functools.cache
@@ -249,7 +249,7 @@ class OneProcess:
     """
 
     def __init__(
-        self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None, knowing: int = 0
+        self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None, *, knowing: int = 0
     ) -> None:  # fmt: skip
         self._first, self._seed, self._hold, self._knowing = first, seed, hold, knowing
         self._large = world.everyone.agents > LARGE

@@ -251,7 +251,7 @@ def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[
     """What all agents do in one round."""
     spoken = speak(protocol, world, now, round_)
     now, known = hear(protocol, world, spoken)
-    return now, see(world, now.state.x, now.body, *known, spoken.messages, spoken.floats)
+    return now, see(world, now.state.x, now.body, known, (spoken.messages, spoken.floats))
 
 
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
@@ -358,11 +358,11 @@ def _moved(body: Array, target: Array, reach: Array | None) -> Array:
     return jnp.where(distance > reach, body + away * (reach / jnp.where(distance > 0, distance, 1.0)), target)
 
 
-def see(world: World, x: Array, body: Array, known: Array, bound: Array, messages: Array, floats: Array) -> Seen:
-    """What an observer sees of estimates x and positions `body`."""
+def see(world: World, x: Array, body: Array, known: tuple[Array, Array], sent: tuple[Array, Array]) -> Seen:
+    """What an observer sees of estimates x and positions `body`; known: see `knowledge`; sent: messages and floats."""
     margins = world.observer.agent_margins(body)
     smooth = world.observer.smooth_margin(body, world.everyone.nu)
-    return Seen(body, jnp.min(margins), smooth, margins, x, known, bound, messages, floats)
+    return Seen(body, jnp.min(margins), smooth, margins, x, *known, *sent)
 
 
 def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
@@ -396,7 +396,7 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
     start = first[world.own]
     heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
     now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
-    return now, see(world, first, start, jnp.asarray(0), jnp.asarray(jnp.nan), jnp.asarray(0), jnp.asarray(0))
+    return now, see(world, first, start, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
 
 
 def precision_for(count: int) -> prox.Precision:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -152,7 +152,7 @@ def simulate_rounds(
         engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
     else:
         world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
-        engine = OneProcess(protocol, world, first, weather.seed, choice, hold, ENOUGH[stop])
+        engine = OneProcess(protocol, world, first, weather.seed, choice, hold, knowing=ENOUGH[stop])
     rules = Rules(
         end=PATIENCE if rounds is None else rounds, stop=stop, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
@@ -236,14 +236,16 @@ class _Course:
         numbers = self.tally.add(chunk)
         chosen = np.flatnonzero(numbers % every == 0)
         kept = Kept(*(np.asarray(leaf)[: len(chosen)] for leaf in chunk.kept))
-        return self._rows(numbers[chosen], *(np.asarray(leaf)[chosen] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound)), kept)
+        margins = [np.asarray(leaf)[chosen] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound)]
+        return self._rows(numbers[chosen], margins, kept)
 
     def look(self, state: Any) -> Rows:
         tally = self.tally
-        last = (np.array([number]) for number in (tally.done, tally.margin, tally.smooth_margin, tally.bound))
-        return self._rows(*last, Kept(*(leaf[None] for leaf in self._engine.look(state))))
+        margins = [np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound)]
+        return self._rows(np.array([tally.done]), margins, Kept(*(leaf[None] for leaf in self._engine.look(state))))
 
-    def _rows(self, step: np.ndarray, margin: np.ndarray, smooth_margin: np.ndarray, bound: np.ndarray, kept: Kept) -> Rows:
+    def _rows(self, step: np.ndarray, margins: Sequence[np.ndarray], kept: Kept) -> Rows:
+        margin, smooth_margin, bound = margins
         estimate = None if self._choice.copies is None else kept.estimate
         return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound)
 

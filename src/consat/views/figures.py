@@ -175,8 +175,8 @@ def margins(result: Result) -> Figure:
         dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
         axes.plot(data[clock], curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
     if proves:
-        proven = data["bound"].where(np.isfinite(data["bound"]))
-        axes.plot(data[clock], proven, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
+        bound = data["bound"].where(np.isfinite(data["bound"]))
+        axes.plot(data[clock], bound, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
     axes.margins(y=0.08)
     _stretch(axes, *(data[name].values for name, *_ in curves))
     lower, upper = summary.get("bounds") or (None, None)
