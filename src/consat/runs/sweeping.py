@@ -29,7 +29,7 @@ from consat.settings import Start
 from consat.simulate import Stop
 from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
 from consat.simulate.kernel import Weather, world_of
-from consat.simulate.rounds import PATIENCE, Rules, stillness
+from consat.simulate.rounds import PATIENCE, Rules, longest_hold, stillness
 from consat.teams.team import Team
 
 SCHEMA = "consat.sweep/1"
@@ -273,7 +273,7 @@ class _Asked:
         default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
         rules = Rules(
             end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,
-            still=stillness(ready.size.length, ready.enough),
+            most=longest_hold(protocol, world), still=stillness(ready.size.length, ready.enough),
             earliest=protocol.earliest(world.everyone), hopeless=ready.hopeless, enough=ready.enough,
         )  # fmt: skip
         return Case(world, gains, rules)

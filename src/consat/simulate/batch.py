@@ -188,14 +188,14 @@ class _Pool:
 
     def advance(self) -> list[int]:
         """A chunk of rounds of every lane; gives the lanes that have ended."""
-        number, rounds, streak, hold, near, knowing = (np.zeros(self._size, dtype=np.int64) for _ in range(6))
+        number, rounds, streak, hold, most, near, knowing = (np.zeros(self._size, dtype=np.int64) for _ in range(7))
         for place, lane in self.running.items():
             tally, rules = self.tallies[lane], self._lanes[lane].case.rules
             number[place], streak[place], near[place] = tally.done, tally.streak, tally.near
             rounds[place] = min(CHUNK, rules.end - tally.done)
-            hold[place] = HOLD if rules.stop == "satisfied" else NEVER
+            hold[place], most[place] = (HOLD, rules.most) if rules.stop == "satisfied" else (NEVER, NEVER)
             knowing[place] = ENOUGH[rules.stop]
-        ask = Ask(*(jnp.asarray(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, near, knowing)))
+        ask = Ask(*(jnp.asarray(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
         self._state, chunk = _compiled()[1](self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
         chunk, self._positions = jax.tree.map(np.asarray, (chunk, self._state.body))
         ended = []

@@ -14,7 +14,7 @@ from jax import Array
 
 from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
-from consat.simulate.kernel import Now, Seen, World, begin, one_round, see
+from consat.simulate.kernel import SATISFIED, Now, Seen, World, begin, one_round, see
 from consat.simulate.recording import Choice
 from consat.simulate.violations import violated
 
@@ -140,6 +140,7 @@ class _Loop(NamedTuple):
     done: Array
     now: Now
     streak: Array
+    told: Array
     places: Array
     chunk: Chunk
 
@@ -156,14 +157,16 @@ def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Arr
 
 
 class Ask(NamedTuple):
-    """Of the arguments of `Engine.advance` the numbers; `hold`: how many satisfied rounds on end end the run; and `knowing`: what all must
-    know, for `SURE` rounds on end, to end it, as bits; see `consat.simulate.kernel.knowledge`."""
+    """Of the arguments of `Engine.advance` the numbers; `hold`: how many satisfied rounds on end end the run, if all know it by then, and
+    `most`: how many at the latest; and `knowing`: what all must know, for `SURE` rounds on end, to end it, as bits; see
+    `consat.simulate.kernel.knowledge`."""
 
     number: Array
     rounds: Array
     streak: Array
     every: Array
     hold: Array
+    most: Array
     near: Array
     knowing: Array
 
@@ -205,13 +208,18 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
         places = jnp.where((ask.number + at.done + 1) % ask.every == 0, at.places + 1, at.places)
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
-        near = jnp.where(seen[SCALARS.index("known")] & ask.knowing > 0, chunk.near + 1, 0)
-        return _Loop(at.done + 1, now, streak, places, Chunk(at.done + 1, **numbers, near=near, drift=drift, violated=count, kept=kept))
+        known = seen[SCALARS.index("known")]
+        near = jnp.where(known & ask.knowing > 0, chunk.near + 1, 0)
+        told = known & SATISFIED > 0
+        return _Loop(
+            at.done + 1, now, streak, told, places, Chunk(at.done + 1, **numbers, near=near, drift=drift, violated=count, kept=kept)
+        )
 
     def goes_on(at: _Loop) -> Array:
-        return (at.done < ask.rounds) & (at.streak < ask.hold) & (at.chunk.near < SURE)
+        satisfied = (at.streak >= ask.hold) & (at.told | (at.streak >= ask.most))
+        return (at.done < ask.rounds) & ~satisfied & (at.chunk.near < SURE)
 
-    end = jax.lax.while_loop(goes_on, step, _Loop(empty.done, now, ask.streak, empty.done, empty))
+    end = jax.lax.while_loop(goes_on, step, _Loop(empty.done, now, ask.streak, jnp.asarray(False), empty.done, empty))
     return end.now, end.chunk
 
 
@@ -244,12 +252,13 @@ class OneProcess:
         first: (C, d) first estimates.
         seed: of what goes wrong.
         choice: what is recorded.
-        hold: how many satisfied rounds on end are the end; None if nothing of the kind is.
+        hold: how many satisfied rounds on end are the end, at the earliest and at the latest; None if nothing of the kind is.
         knowing: what all must know for the end; see `Ask`.
     """
 
     def __init__(
-        self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: int | None, *, knowing: int = 0
+        self, protocol: Rounds, world: World, first: np.ndarray, seed: int, choice: Choice, hold: tuple[int, int] | None, *,
+        knowing: int = 0,
     ) -> None:  # fmt: skip
         self._first, self._seed, self._hold, self._knowing = first, seed, hold, knowing
         self._large = world.everyone.agents > LARGE
@@ -261,8 +270,8 @@ class OneProcess:
         return _compiled(self._large)[0](self._protocol, self.world, self._chosen, first, key)
 
     def advance(self, state: Now, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[Now, Chunk]:
-        hold = NEVER if self._hold is None else self._hold
-        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak[0], every, hold, streak[1], self._knowing)))
+        hold, most = (NEVER, NEVER) if self._hold is None else self._hold
+        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak[0], every, hold, most, streak[1], self._knowing)))
         return _compiled(self._large)[1](self._protocol, self.world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:

@@ -18,7 +18,7 @@ from consat.scale import Scale
 from consat.simulate import Stop
 from consat.simulate.checkpoint import Checkpoint, fingerprint
 from consat.simulate.engine import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
-from consat.simulate.kernel import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, world_of
+from consat.simulate.kernel import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, World, world_of
 from consat.simulate.loop import Steps, follow
 from consat.simulate.recording import Choice, Memory, Rows, Sink, velocities
 from consat.simulate.violations import shares
@@ -27,6 +27,8 @@ from consat.trace import Ending, Trace
 
 ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
 """What all must know for a run to end, for each stop rule."""
+WORD = 10
+"""Where agents tell each other of their bodies, a satisfied team goes on until all know it, for at most so many rounds a hop more."""
 HOLD = 10
 """How many rounds on end every margin must stay positive before a team counts as satisfied."""
 PATIENCE = 2000
@@ -98,6 +100,11 @@ def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> flo
     return (SETTLED if enough is None else SETTLED_ALL_THE_SAME) * length
 
 
+def longest_hold(protocol: Rounds, world: World) -> int:
+    """How many rounds on end a team may be satisfied before its run ends, though not all know it."""
+    return HOLD + (WORD * (1 + world.everyone.hops) if protocol.speaks == "pair" else 0)
+
+
 @float64
 def simulate_rounds(
     team: Team,
@@ -144,17 +151,20 @@ def simulate_rounds(
     """
     weather = weather or Weather()
     choice = choice or Choice.of(team, copies, estimates=record)
-    hold = HOLD if stop == "satisfied" else None
+    most = HOLD
     engine: Engine
     if jax.process_count() > 1:
         from consat.simulate.cluster import ManyProcesses
 
+        hold = HOLD if stop == "satisfied" else None
         engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
     else:
         world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
-        engine = OneProcess(protocol, world, first, weather.seed, choice, hold, knowing=ENOUGH[stop])
+        most = longest_hold(protocol, world)
+        ends = (HOLD, most) if stop == "satisfied" else None
+        engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
     rules = Rules(
-        end=PATIENCE if rounds is None else rounds, stop=stop, still=stillness(size.length, enough),
+        end=PATIENCE if rounds is None else rounds, stop=stop, most=most, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
         hopeless=hopeless, enough=enough,
     )  # fmt: skip
@@ -170,6 +180,7 @@ class Rules:
     Attributes:
         end: rounds at most.
         stop: when to end earlier.
+        most: how many satisfied rounds on end are the end, whether all know it or not.
         still: a chunk in which no position moved farther is one in which the team stood still, length.
         earliest: the round before which to stand still means nothing.
         hopeless: see `simulate_rounds`.
@@ -179,6 +190,7 @@ class Rules:
     end: int
     stop: Stop
     still: float
+    most: int = HOLD
     earliest: int = 0
     hopeless: Callable[[np.ndarray], bool] = lambda _: False
     enough: Callable[[np.ndarray], bool] | None = None
@@ -189,7 +201,7 @@ class Rules:
             return "diverged"
         if self.stop == "never":
             return None
-        if self.stop == "satisfied" and tally.streak >= HOLD:
+        if self.stop == "satisfied" and tally.streak >= HOLD and (tally.known & SATISFIED or tally.streak >= self.most):
             return "satisfied"
         if tally.near >= SURE:
             return "settled"
