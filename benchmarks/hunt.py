@@ -40,10 +40,10 @@ import consat as cs
 from consat.central import assumptions
 from consat.numerics import float64
 
-PROTOCOLS = ("admm", "max-min", "gradient-flow")
+PROTOCOLS = ("interior-point", "admm", "gradient-flow")
 """Of `run`."""
-SETTLES = ("admm",)
-"""Those of which it is asked that they satisfy what SciPy does."""
+SETTLES = ("interior-point", "admm")
+"""Those of which it is counted how often they satisfy what SciPy does."""
 COMMANDS = ("check", *PROTOCOLS, "solve", "plot")
 BOX = 4.0
 """Starts are drawn in this box, and so is the formation that is hidden."""
