@@ -34,16 +34,18 @@ class Scale(NamedTuple):
     """The natural size of a team.
 
     Attributes:
-        psi: the scale of ψ, in its units.
+        psi: the smallest scale of a ψ, in its units.
         length: of the positions.
         center: (d,) mean of the points that constraints on one agent alone point to.
         spread: largest distance of such a point from the centre on any axis.
+        typical: the median of the scales of all ψ.
     """
 
     psi: float
     length: float
     center: np.ndarray
     spread: float
+    typical: float
 
     @property
     def reach(self) -> float:
@@ -89,7 +91,8 @@ def scale(team: Team) -> Scale:
     sizes = np.concatenate([psi[curved], slope[flat] * length])
     center = centers.mean(axis=0) if len(centers) else np.zeros(team.dimension)
     spread = float(np.abs(centers - center).max(initial=0.0))
-    return Scale(float(sizes.min(initial=np.inf)) if len(sizes) else 1.0, length, center, spread)
+    smallest, typical = (float(sizes.min()), float(np.median(sizes))) if len(sizes) else (1.0, 1.0)
+    return Scale(smallest, length, center, spread, typical)
 
 
 def automatic(size: Scale) -> Smoothing:

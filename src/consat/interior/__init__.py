@@ -76,7 +76,7 @@ class Interior:
         """The mail before anything was said; leading axis P."""
         p, pairs = self.plan.width, len(self.talker)
         matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
-        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, Proof(matrix, vector, number, number, number))
+        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, Proof(matrix, vector, number, number - 1.0, number))
 
     def across(self, mail: Mail) -> Mail:
         """What stands at the other ends."""
@@ -87,7 +87,7 @@ class Interior:
 
         def start(batch: Batch) -> Memory:
             y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
-            return _out(step.begin(_lanes(batch, self.units, gains), y))
+            return _out(step.begin(_lanes(batch, self.units, gains, self.plan.exact), y, gains))
 
         return self._collected([start(batch) for batch in self.plan.batches])
 
@@ -117,7 +117,7 @@ class Interior:
                 at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
                 Proof(*map(at, inbox.proof)),
             )  # fmt: skip
-            found, mail = step.act(_lanes(batch, units, gains), shared, rows < len(y), mine, heard, told[agents], gains)
+            found, mail = step.act(_lanes(batch, units, gains, self.plan.exact), shared, rows < len(y), mine, heard, told[agents], gains)
             return _out(found), jax.tree.map(lambda leaf: _widened(leaf, self.plan.width), mail)
 
         found = [turn(batch) for batch in self.plan.batches]
@@ -147,9 +147,9 @@ def _normal(x: Array, units: Units) -> Array:
     return (x - units.center[None]) / units.length
 
 
-def _lanes(batch: Batch, units: Units, gains: Gains) -> Lanes:
+def _lanes(batch: Batch, units: Units, gains: Gains, exact: bool) -> Lanes:
     n, count = batch.rows.shape[1:]
-    return Lanes(batch, jax.tree.map(lambda leaf: leaf[0], batch.kinds), units, gains.cap, (n, len(units.center), count))
+    return Lanes(batch, jax.tree.map(lambda leaf: leaf[0], batch.kinds), units, gains.cap, (n, len(units.center), count), exact)
 
 
 def _out(memory: Memory) -> Memory:

@@ -55,7 +55,7 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
         whole, positive = at
         pivot = whole[j, j]
         row = whole[j] / pivot[None]
-        factor = jnp.where(jnp.arange(size)[:, None] == j, 0.0, whole[:, j])
+        factor = jnp.where(jnp.arange(size, dtype=j.dtype)[:, None] == j, 0.0, whole[:, j])
         return (whole - factor[:, None] * row[None]).at[j].set(row), positive & (pivot > 0)
 
     start = jnp.concatenate([matrix, right], axis=1), jnp.ones(matrix.shape[-1], bool)

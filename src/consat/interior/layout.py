@@ -101,6 +101,7 @@ class Plan:
         pair: (P,) of each end of a link.
         floats: (P,) how many numbers a message over each end holds.
         width: variables that two neighbours share, at most.
+        exact: whether what agents share travels along trees: then nothing that one has said comes back to it through others.
     """
 
     batches: tuple[Batch, ...]
@@ -110,6 +111,7 @@ class Plan:
     pair: Array
     floats: Array
     width: int = field(metadata={"static": True})
+    exact: bool = field(metadata={"static": True})
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,11 @@ def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
     return found[np.lexsort((found[:, 1], found[:, 0]))]
 
 
+def _tree_links(copies: Estimates) -> int:
+    """How many links the clusters have where these are trees."""
+    return len(copies.own) - 1 - int(copies.cluster.max(initial=-1))
+
+
 WIDE = 40
 """Copies travel along the tree while no message holds more than about this many shared numbers, and along the links beyond."""
 
@@ -187,7 +194,7 @@ WIDE = 40
 def route_of(team: Team, layout: Literal["full", "local"]) -> tuple[Route, Estimates]:
     """Along what the copies of a team travel, and who holds what then. Exact is the tree; it is taken wherever it is narrow enough."""
     along_links = Estimates.of(team, layout)
-    if len(along_links.links) == team.count - 1 - int(along_links.cluster.max(initial=0)):
+    if len(along_links.links) == _tree_links(along_links):
         return "tree", along_links
     tree = team.with_links(spanning_tree(team.count, along_links.links))
     along_tree = Estimates.of(tree, layout)
@@ -214,7 +221,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     held = np.diff(first)
     degree = np.bincount(shared.pairs[:, 0], minlength=count)
     size = shared.sizes(d)
-    widest = np.zeros(count, dtype=np.int64)
+    widest = np.ones(count, dtype=np.int64)
     np.maximum.at(widest, shared.pairs[:, 0], size)
     power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # up to 8, 32, 128, …
     if count * max(degree.max(initial=0), 1) * (held.max(initial=0) * d + 1) ** 2 <= ALIKE:
@@ -244,7 +251,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        jnp.asarray(floats), int(size.max(initial=0)),
+        jnp.asarray(floats), int(size.max(initial=1)), len(shared.pairs) == 2 * _tree_links(copies),
     )  # fmt: skip
 
 

@@ -20,10 +20,17 @@ from consat.scale import Scale
 
 NUDGE = 1e-3
 """Copies begin by this part of the way from the own place to the first estimate, so that no two fall together."""
+WIDER = 0.1
+"""The same where a ψ is not quadratic: where places coincide norms have a kink, and inverse distances a pole, that one leaves slowly."""
+TRIES = 24
+"""Places that are tried, ever farther away, where a ψ is not a number at the start."""
 SHORTEST = 1e-9
 """A step of which no part as long as this is allowed is not taken."""
 NEAR = 1e-3
 """The least slack at the start, in units of ψ."""
+BACK, RAISE, EASE, HEAVIEST = 0.3, 2.0, 0.7, 10.0
+"""An agent that steps back by this part of its last step raises its inertia by a factor, and eases it by another where not, between once
+and so many times that of the protocol."""
 GAP = 1e-2
 """Levels that differ by less need not come down at once, in units of ψ."""
 
@@ -46,7 +53,7 @@ class Units(NamedTuple):
     @classmethod
     def of(cls, size: Scale) -> Units:
         """From the natural size of a team."""
-        return cls(jnp.asarray(size.center), jnp.asarray(size.length), jnp.asarray(size.psi), jnp.asarray(size.reach / size.length))
+        return cls(jnp.asarray(size.center), jnp.asarray(size.length), jnp.asarray(size.typical), jnp.asarray(size.reach / size.length))
 
 
 class Memory(NamedTuple):
@@ -60,6 +67,9 @@ class Memory(NamedTuple):
         barrier: μ_i.
         bound: the least proven bound on the best margin so far.
         age: rounds since the start.
+        inertia: κ_i, as a multiple of the protocol's.
+        swing: the last step, along a direction that stays the same.
+        warm: rounds left in which it maximises the mean of its margins.
     """
 
     y: Array
@@ -69,6 +79,9 @@ class Memory(NamedTuple):
     barrier: Array
     bound: Array
     age: Array
+    inertia: Array
+    swing: Array
+    warm: Array
 
 
 class Proof(NamedTuple):
@@ -78,7 +91,7 @@ class Proof(NamedTuple):
         matrix: (g, p, p) L; nothing of the level.
         vector: (g, p) e.
         constant: (g,) c.
-        weight: (g,) Σ λ; 0 where there is no proof.
+        weight: (g,) Σ λ; negative where there is no proof.
         error: (g,) what rounding may have taken off c.
     """
 
@@ -122,6 +135,7 @@ class Gains:
     apart: float
     drop: float
     warm: int
+    far: float
 
 
 @dataclass(frozen=True)
@@ -133,7 +147,8 @@ class Lanes:
         kinds: their constraints, without the axis of chunks.
         units: see there.
         cap: what the level need not exceed, in units of ψ; None without a cap.
-        size: (n, d, A).
+        shape: (n, d, A).
+        exact: whether proofs can be told: see `Plan`.
     """
 
     batch: Batch
@@ -141,6 +156,13 @@ class Lanes:
     units: Units
     cap: float | None
     shape: tuple[int, int, int]
+    exact: bool
+
+    @property
+    def quadratic(self) -> Array:
+        """(A,) whether all of an agent's ψ are."""
+        others = [kind.used.any(axis=0) for form, kind in self._each() if not form.quadratic]
+        return ~jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *others]), axis=0)
 
     @property
     def used(self) -> Array:
@@ -256,21 +278,44 @@ class Here(NamedTuple):
         return cls(*lanes.slopes(y), lanes.bends(y))
 
 
-def begin(lanes: Lanes, y: Array) -> Memory:
+def begin(lanes: Lanes, y: Array, gains: Gains) -> Memory:
     """What an agent begins with: every copy near its own place, and the level below its margin there.
 
     Args:
         lanes: its constraints.
         y: (n, d, A) first estimates, its own first.
+        gains: of the protocol.
     """
-    y = y[:1] + NUDGE * (y - y[:1])
+    y = placed(lanes, y)
+    psi = lanes.psi(y)
     number = jnp.zeros(y.shape[-1])
-    return Memory(y, *centered(lanes, lanes.psi(y)), number + jnp.inf, number)
+    violated = (jnp.min(psi[:-1], axis=0, initial=jnp.inf) < -gains.far) & lanes.quadratic
+    return Memory(y, *centered(lanes, psi), number + jnp.inf, number, number + 1.0, number, jnp.where(violated, float(gains.warm), 0.0))
+
+
+def placed(lanes: Lanes, y: Array) -> Array:
+    """(n, d, A) where an agent's copies begin: near its own place; where one of its ψ is not a number there, at its first estimates, and
+    failing that at the nearest of `TRIES` places around those at which it is one."""
+    near = y[:1] + jnp.where(lanes.quadratic, NUDGE, WIDER)[None, None] * (y - y[:1])
+
+    def wrong(y: Array) -> Array:
+        return jnp.any(lanes.used & (lanes.psi(y) == -jnp.inf), axis=0)
+
+    def body(at: tuple[Array, Array]) -> tuple[Array, Array]:
+        k, now = at
+        phase = jnp.arange(1.0, now[..., 0].size + 1).reshape(now.shape[:2])[:, :, None]
+        away = jnp.sin(1e3 * (k + 1.0) * phase + 1e2 * y) * lanes.units.reach * 2.0 ** (0.25 * (k - 20.0))
+        return k + 1.0, jnp.where(wrong(now), jnp.where(k == 0.0, y, y + away), now)
+
+    def more(at: tuple[Array, Array]) -> Array:
+        return (at[0] <= float(TRIES)) & jnp.any(wrong(at[1]))
+
+    return jax.lax.while_loop(more, body, (jnp.zeros(()), near))[1]
 
 
 def centered(lanes: Lanes, psi: Array) -> tuple[Array, Array, Array, Array]:
     """(m − 1, A) λ, (A,) λ of the cap, level and barrier: on the central path, of a level well below the margin."""
-    used = lanes.used
+    used = lanes.used & (psi > -jnp.inf)
     margin = jnp.min(jnp.where(used, psi, jnp.inf)[:-1], axis=0, initial=jnp.inf)
     some = jnp.isfinite(margin)
     level = jnp.where(some, margin - jnp.maximum(NEAR, jnp.abs(margin)), 0.0)
@@ -305,18 +350,19 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
         gains: of the protocol.
     """
     n, d, count = memory.y.shape
-    size, used = n * d + 1, lanes.used
-    some = used[:-1].any(axis=0)
+    size = n * d + 1
+    some = lanes.used[:-1].any(axis=0)
     outside, pull = spread(inbox.matrix, inbox.vector, shared, size)
     said = inbox.barrier >= 0
     lowest = jnp.min(jnp.where(said, inbox.level, jnp.inf), axis=0, initial=jnp.inf)
     y, level, barrier = memory.y, memory.level, memory.barrier
     multiplier = jnp.concatenate([memory.multiplier, memory.lid[None]])
-    warm = some & (memory.age < gains.warm)
+    warm = memory.warm > 0
 
     # come down to the lowest level heard; or, if constraints moved, below the margin
     here = Here.of(lanes, y)
-    margin = jnp.min(here.psi[:-1], axis=0, initial=jnp.inf)
+    used = lanes.used & (here.psi > -jnp.inf)  # what is not a number here has no slope to follow
+    margin = jnp.min(here.psi[:-1], axis=0, initial=jnp.inf, where=used[:-1])
     low = jnp.min(jnp.where(used, here.psi - level[None], jnp.inf), axis=0)
     lower = jnp.where(lowest < level - jnp.maximum(gains.drop * low, GAP), lowest, level)
     lower = jnp.where(margin <= lower, margin - jnp.maximum(GAP, 0.1 * jnp.abs(margin - lower)), lower)
@@ -327,12 +373,15 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
     multiplier = jnp.where(moved[None] & used, jnp.minimum(multiplier, barrier[None] / s), multiplier)
 
     # Newton
-    matrix, gradient = model(here, s, multiplier, barrier, used, warm, gains)
+    matrix, gradient = model(here, Point(s, multiplier, barrier, used, warm, memory.inertia * gains.inertia), gains)
     flat = jnp.concatenate([y.reshape(n * d, count), level[None]])
     step, _ = solve(matrix + outside, (pull - gradient - times(outside, flat))[:, None])
-    step = jnp.where(jnp.isfinite(step[:, 0]), step[:, 0], 0.0)
+    step = jnp.where(jnp.isfinite(step).all(axis=(0, 1)), step[:, 0], 0.0)
     least = jnp.where(warm[None], -jnp.inf, (1.0 - gains.boundary) * s)
-    scale = longest(lanes, flat, step, jnp.where(used, least, -jnp.inf), warm)
+    scale = longest(lanes, flat, step, jnp.where(used, least, -jnp.inf), used)
+    swing = jnp.sum(jnp.cos(2.4 * jnp.arange(1.0, n * d + 1))[:, None] * step[:-1], axis=0) * scale
+    back = swing * memory.swing < -BACK * memory.swing**2
+    inertia = jnp.clip(memory.inertia * jnp.where(back, RAISE, EASE), 1.0, HEAVIEST)
     flat = flat + scale[None] * step
     y, level = flat[:-1].reshape(y.shape), flat[-1]
     along = jnp.sum(here.slopes * step[None, :-1], axis=1) - step[-1][None]
@@ -344,6 +393,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
     here = Here.of(lanes, y)
     fresh = centered(lanes, here.psi)
     level = jnp.where(warm, fresh[2], level)
+    used = lanes.used & (here.psi > level[None])  # not what has only now become a number
     margin = jnp.min(here.psi[:-1], axis=0, initial=jnp.inf)
     s = jnp.where(used, here.psi - level[None], 1.0)
     center = barrier[None] / s
@@ -357,8 +407,9 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
     barrier = jnp.where(warm, fresh[3], barrier)
 
     # what to say
-    warm = some & (memory.age + 1 < gains.warm)
-    matrix, gradient = model(here, s, multiplier, barrier, used, warm, gains)
+    rest = jnp.maximum(memory.warm - 1.0, 0.0)
+    warm = rest > 0
+    matrix, gradient = model(here, Point(s, multiplier, barrier, used, warm, inertia * gains.inertia), gains)
     flat = jnp.concatenate([y.reshape(n * d, count), level[None]])
     left, e, _, fine = reduced(matrix + outside, times(matrix, flat) - gradient + pull, shared)
     left, e = left - inbox.matrix, e - inbox.vector
@@ -377,7 +428,10 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
         behind,
         proof,
     )
-    return Memory(y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(memory.bound, bound), memory.age + 1), mail
+    told = Memory(
+        y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(memory.bound, bound), memory.age + 1, inertia, swing, rest
+    )
+    return told, mail
 
 
 def _least_of_others(numbers: Array) -> Array:
@@ -388,8 +442,29 @@ def _least_of_others(numbers: Array) -> Array:
     return jnp.where(mine, second[None], least[None])
 
 
-def model(here: Here, s: Array, multiplier: Array, barrier: Array, used: Array, warm: Array, gains: Gains) -> tuple[Array, Array]:
+class Point(NamedTuple):
+    """Where the barrier problem of an agent stands; m counts the cap.
+
+    Attributes:
+        slack: (m, A) ψ − t.
+        multiplier: (m, A).
+        barrier: (A,).
+        used: (m, A) which constraints count.
+        warm: (A,) whether the mean of the margins is maximised.
+        inertia: (A,).
+    """
+
+    slack: Array
+    multiplier: Array
+    barrier: Array
+    used: Array
+    warm: Array
+    inertia: Array
+
+
+def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
     """(N, N, A) the matrix and (N, A) the gradient of Newton's step; where `warm`, (A,), of the mean of the margins, without a level."""
+    s, multiplier, barrier, used, warm, inertia = point
     count = s.shape[-1]
     some = used[:-1].any(axis=0)
     which, weights, vectors = here.bends
@@ -405,19 +480,19 @@ def model(here: Here, s: Array, multiplier: Array, barrier: Array, used: Array, 
     gradient = gradient.at[-1].add(jnp.where(some, -1.0, 0.0))
     gradient = gradient.at[-1].set(jnp.where(warm, 0.0, gradient[-1]))
     trace = jnp.trace(matrix) / len(matrix)
-    still = jnp.where(warm, 1e-6, gains.inertia) + 1e-12 * trace
+    still = jnp.where(warm, 1e-6, inertia) + 1e-12 * trace
     own = jnp.where(warm, 1.0, 1e-9 * matrix[-1, -1] + jnp.where(some, 0.0, 1e-9))
     last = jnp.arange(len(matrix))[:, None] == len(matrix) - 1
     return matrix + jnp.eye(len(matrix))[:, :, None] * jnp.where(last, own[None], still[None])[:, None], gradient
 
 
-def longest(lanes: Lanes, flat: Array, step: Array, least: Array, warm: Array) -> Array:
-    """(A,) the longest part of a step after which every slack is at least `least`, (m, A), and every ψ a number."""
+def longest(lanes: Lanes, flat: Array, step: Array, least: Array, used: Array) -> Array:
+    """(A,) the longest part of a step after which every slack is at least `least`, (m, A), and every ψ of those `used` a number."""
 
     def good(scale: Array) -> Array:
         new = flat + scale[None] * step
         psi = lanes.psi(new[:-1].reshape(lanes.shape))
-        return jnp.all((psi - new[-1][None] >= least) & (psi > -jnp.inf), axis=0)
+        return jnp.all((psi - new[-1][None] >= least) & ((psi > -jnp.inf) | ~used), axis=0)
 
     def body(at: tuple[Array, Array]) -> tuple[Array, Array]:
         scale, done = at
@@ -431,21 +506,23 @@ def longest(lanes: Lanes, flat: Array, step: Array, least: Array, warm: Array) -
 REGION = 10.0
 """The region of which a proof speaks, in reaches of the team's places around their middle."""
 SLACK = 3e-4
-"""What that region may add to the bound at most, in units of ψ."""
+"""What that region may add to the bound at most, in units of ψ; a little more where agents without constraints relay."""
+IDLE = 0.01
+"""The part of an agent without constraints in that, whose Σ λ is 0."""
 
 
 def prove(lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multiplier: Array, inbox: Proof) -> tuple[Proof, Array]:
     """The proof for each neighbour, and (A,) a bound on the best margin: max_x Σ λψ / Σ λ over all agents (design, section 9).
 
     A ψ that is not quadratic stands in by its tangent, which is above it everywhere if it is concave. So that no direction is flat, every
-    agent adds ε Σλ (R² − ‖x_i‖²), which is not negative in the region of radius R around the team's middle.
+    agent adds ε w (R² − ‖x_i‖²), w being its Σλ or `IDLE`, which is not negative in the region of radius R around the team's middle.
     """
     n, d, count = y.shape
     size, (g, p, _) = n * d, shared.shape
-    if not all(form.concave for form in lanes.batch.forms):
+    if not lanes.exact or not all(form.concave for form in lanes.batch.forms):
         zero = jnp.zeros((g, count))
-        return Proof(jnp.zeros((g, p, p, count)), jnp.zeros((g, p, count)), zero, zero, zero), jnp.full(count, jnp.inf)
-    used, flat = lanes.used[:-1], y.reshape(size, count)
+        return Proof(jnp.zeros((g, p, p, count)), jnp.zeros((g, p, count)), zero, zero - 1.0, zero), jnp.full(count, jnp.inf)
+    used, flat = lanes.used[:-1] & (here.psi[:-1] > -jnp.inf), y.reshape(size, count)
     psi, slopes, multiplier = jnp.where(used, here.psi[:-1], 0.0), here.slopes[:-1], jnp.where(used, multiplier[:-1], 0.0)
     which, weights, vectors = lanes.bends(y, quadratic=True)
     matrix = gram(weights * multiplier[which], vectors) if len(which) else jnp.zeros((size, size, count))
@@ -455,19 +532,19 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multip
     eps = 8.0 * size * jnp.finfo(y.dtype).eps
     sizes = jnp.abs(multiplier * psi).sum(axis=0) + jnp.sum(jnp.abs(slope * flat) + flat**2 * jnp.abs(matrix).sum(axis=1), axis=0)
     reach = REGION * lanes.units.reach
-    curve = SLACK / reach**2
+    curve = SLACK / reach**2 * jnp.where(used.any(axis=0), weight, IDLE)
     own = (jnp.arange(size) < d)[:, None]
     absent = jnp.repeat(~held, d, axis=0, total_repeat_length=size)
-    matrix = matrix + jnp.eye(size)[:, :, None] * (jnp.where(own, 2 * curve * weight[None], 0.0) + absent.astype(float))[:, None]
+    matrix = matrix + jnp.eye(size)[:, :, None] * (jnp.where(own, 2 * curve[None], 0.0) + absent.astype(float))[:, None]
 
     places = jnp.where(shared < size, shared, size)  # the level is no variable of the proof
     outside, pull = spread(inbox.matrix, inbox.vector, places, size)
-    neighbour, have = (shared <= size).any(axis=1), inbox.weight > 0
+    neighbour, have = (shared <= size).any(axis=1), inbox.weight >= 0
     missing = number(neighbour & ~have)
     total, forces = matrix + outside, vector + pull
-    height = constant + curve * weight * reach**2 + jnp.sum(inbox.constant, axis=0)
+    height = constant + curve * reach**2 + jnp.sum(inbox.constant, axis=0)
     error = eps * sizes + jnp.sum(inbox.error, axis=0)
-    mass = weight + jnp.sum(inbox.weight, axis=0)
+    mass = weight + jnp.sum(jnp.where(have, inbox.weight, 0.0), axis=0)
     found, fine = solve(total, forces[:, None])
     gain = 0.5 * jnp.sum(forces * found[:, 0], axis=0)
     bound = (height + gain + error + eps * (jnp.abs(height) + jnp.abs(gain))) / jnp.where(mass > 0, mass, 1.0)
@@ -481,5 +558,7 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multip
     return Proof(
         jnp.where(good[:, None, None], left, 0.0),
         jnp.where(good[:, None], e, 0.0),
-        *(jnp.where(good, each, 0.0) for each in (constant, mass[None] - inbox.weight, error)),
+        jnp.where(good, constant, 0.0),
+        jnp.where(good, mass[None] - jnp.where(have, inbox.weight, 0.0), -1.0),
+        jnp.where(good, error, 0.0),
     ), bound

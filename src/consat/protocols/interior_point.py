@@ -9,7 +9,7 @@ has strictly feasible points wherever the team is: lower t. Agent i holds copies
     M   = Σ_k (λ_k/s_k) a_k a_kᵀ − Σ_k λ_k ∇²ψ_k + κ I,     g = −e_t − Σ_k (μ_i/s_k) a_k
     Δ   = −(M + A)⁻¹ (g + A y − b),                          A, b: the neighbours' last quadratics ½ zᵀLz − eᵀz, added up
     y⁺  = y + α Δ,   λ⁺ = λ + (μ/s − λ − (λ/s) aᵀΔ),         cut so that a part of every slack and multiplier is left
-    μ⁺  = max(σ λ·s/m,  floor,  μ_j/3,  0.3 |t_j − t_i|)
+    μ⁺  = max(σ λ·s/m,  floor,  μ_j/3,  0.1 |t_j − t_i|)
     send j:  the quadratic of M + A − A_j, minimised over all variables not shared with j;  μ_i, t_i
 
 A lost message leaves the last one in force; nothing has to be in step. Of ∇²ψ only the concave part counts. The level travels along a
@@ -22,6 +22,7 @@ With a cap the level is at most that: no more margin is asked for, and far parts
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -57,26 +58,28 @@ class InteriorPoint:
 
     Attributes:
         cap: of the level, in the team's unit of ψ; None for the exact max-min.
-        inertia: κ, in units of ∇²ψ: keeps agents where they are that have what they need.
+        inertia: κ at least, in units of ∇²ψ: keeps agents where they are that have what they need. Agents that swing raise theirs.
         centering: σ.
         boundary: the part of any slack or multiplier that a step may take.
         floor: of μ, relative to the level or in the team's unit of ψ.
         couple: μ_i is at least a neighbour's over this.
         apart: μ_i is at least this part of how far levels differ.
         drop: an agent comes down at once to the lowest level heard, if that is below by more than so many times its least slack.
-        warm: rounds in which the mean of the margins is maximised first.
+        warm: rounds in which agents whose margins are below `far` at the start maximise the mean of these first, where all are quadratic.
+        far: below minus this, in the team's unit of ψ.
         name: what ``--protocol`` calls it.
     """
 
-    cap: float | None = 0.1
-    inertia: float = 0.1
+    cap: float | None = 0.3
+    inertia: float = 0.03
     centering: float = 0.5
     boundary: float = 0.7
     floor: float = 1e-4
     couple: float = 3.0
-    apart: float = 0.3
+    apart: float = 0.1
     drop: float = 3.0
-    warm: int = 0
+    warm: int = 1
+    far: float = 0.0
     name: str = "interior-point"
     speaks: ClassVar[str] = "pair"
     per: ClassVar[Mapping[str, Any]] = {
@@ -87,7 +90,7 @@ class InteriorPoint:
     @property
     def gains(self) -> Gains:
         """What a step needs to know of them."""
-        return Gains(self.cap, self.inertia, self.centering, self.boundary, self.floor, self.couple, self.apart, self.drop, self.warm)
+        return Gains(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Gains)})
 
     def earliest(self, solver: Solver) -> int:
         return solver.hops
