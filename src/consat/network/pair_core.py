@@ -88,7 +88,13 @@ class PairCore:
 
 
 def _begin(protocol: InteriorPoint, solver: Alone, first: Array) -> PairState:
-    return PairState(protocol.start(first, solver), jnp.zeros(()), jnp.full(2, jnp.inf), jnp.zeros(()))
+    return _strong(PairState(protocol.start(first, solver), jnp.zeros(()), jnp.full(2, jnp.inf), jnp.zeros(())))
+
+
+def _strong(state: PairState) -> PairState:
+    """The same with types of its own, not those of what it meets: the first state must have those of all later ones, or JAX compiles a
+    turn twice."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), state)
 
 
 def _turn(
@@ -124,7 +130,7 @@ def _turn(
     since = jnp.minimum(since, bound)
     full = (state.turns + 1.0) % FORGET == 0
     bounds = jnp.where(full, jnp.stack([since, jnp.full_like(since, jnp.inf)]), jnp.stack([older, since]))
-    return PairState(inner, changes, bounds, state.turns + 1.0), packing.pack(changes, message), jnp.min(bounds), least
+    return _strong(PairState(inner, changes, bounds, state.turns + 1.0)), packing.pack(changes, message), jnp.min(bounds), least
 
 
 @functools.cache
