@@ -479,7 +479,7 @@ def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
     gradient = -jnp.sum(pressed[:, None] * rows, axis=0)
     gradient = gradient.at[-1].add(jnp.where(some, -1.0, 0.0))
     gradient = gradient.at[-1].set(jnp.where(warm, 0.0, gradient[-1]))
-    trace = jnp.trace(matrix) / len(matrix)
+    trace = jnp.trace(matrix)  # whatever the padding
     still = jnp.where(warm, 1e-6, inertia) + 1e-12 * trace
     own = jnp.where(warm, 1.0, 1e-9 * matrix[-1, -1] + jnp.where(some, 0.0, 1e-9))
     last = jnp.arange(len(matrix))[:, None] == len(matrix) - 1

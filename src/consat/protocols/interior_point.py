@@ -130,16 +130,6 @@ def near(bound: Any, least: Any, unit: Any) -> Any:
     return (bound < jnp.inf) & ((gap <= NEARLY * abs(bound)) | (gap <= EXACTLY * unit))
 
 
-NEARLY, EXACTLY = 0.05, 1e-3
-"""Near the best is within this part of the bound, or within `EXACTLY` in units of ψ."""
-
-
-def near(bound: Any, least: Any, unit: Any) -> Any:
-    """Whether a margin is proven to be near the best; bound: on the best, +∞ without proof; unit: of ψ."""
-    gap = bound - least
-    return (bound < jnp.inf) & ((gap <= NEARLY * abs(bound)) | (gap <= EXACTLY * unit))
-
-
 def max_min() -> InteriorPoint:
     """The same without a cap."""
     return InteriorPoint(cap=None, name="max-min")
