@@ -113,7 +113,7 @@ class Packing:
         dimension, known = whole.team.dimension, {neighbour.id: neighbour for neighbour in whole.neighbours}
         letters = [Letter.of(known[neighbour.id], dimension) for neighbour in part.neighbours]
         kept = [Letter.of(neighbour, dimension) for neighbour in part.neighbours]
-        count = _Flat(width).count
+        count = _Flat(width).total
         longest = max((letter.length for letter in letters), default=0)
         out, back = np.full((len(letters), longest), count), np.full((len(letters), count), longest)
         for row, (letter, there) in enumerate(zip(letters, kept, strict=True)):
@@ -165,7 +165,8 @@ class _Flat(NamedTuple):
             at += size
 
     @property
-    def count(self) -> int:
+    def total(self) -> int:
+        """F."""
         return HEAD + TAIL + 2 * (self.width**2 + self.width)
 
 

@@ -52,6 +52,8 @@ SUPPORT: Final = 3
 """So many messages on end must agree before they do."""
 
 _HEADER: Final = struct.Struct("<4sBBBB8sQQQdddHH")
+_ZERO: Final = 7
+"""Where in the header 0 stands."""
 _SHAPE: Final = struct.Struct("<BII")
 _CHECKSUM: Final = struct.Struct("<I")
 _LARGEST_COUNT: Final = 2**64 - 1
@@ -242,16 +244,14 @@ class Checker:
         end = size - _CHECKSUM.size
         if crc32(memoryview(payload)[:end]) != _CHECKSUM.unpack_from(payload, end)[0]:
             return Reason.CHECKSUM
-        return None
+        return Reason.HEADER if payload[_ZERO] else None
 
     def _check(self, payload: bytes) -> Message | Reason:
         if (broken := self._broken(payload)) is not None:
             return broken
-        _, _, kind, count, zero, problem, *counters, sent, echo, nu_beta, long, far = _HEADER.unpack_from(payload)
+        _, _, kind, count, _, problem, *counters, sent, echo, nu_beta, long, far = _HEADER.unpack_from(payload)
         incarnation, sequence, ack = counters
         end = len(payload) - _CHECKSUM.size
-        if zero != 0:
-            return Reason.HEADER
         at = _HEADER.size
         if payload[at + long : at + long + far] != self._me:
             return Reason.DESTINATION
