@@ -19,13 +19,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consat.network.pairs import INDEFINITE, Letter
 from consat.network.wire import Checker, Kind, Message, Numbers, Reason, encode
 
 PROBLEM = bytes(range(8))
 ME = "änn"
 INF = math.inf
+LETTER = Letter(names=(("x", 0), None), level=True)
+"""Mail of the interior-point protocol about one coordinate and the level: count, μ, t and the least margin, then L11, L12, L22, e1, e2; and
+Σλ, c, the error, L11 and e1 of the proof."""
 EXPECTED: dict[str, dict[Kind, list[Any]]] = {
-    "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)]},
+    "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)], Kind.RESEND: [(1, 2), LETTER.numbers()]},
     "carol": {Kind.STATE: [Numbers((2, 6), (9.0, 9.0, INF, 100.0, 100.0, 1e6))]},  # as of estimates, a margin, a body, and its age
     "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)]},
 }
@@ -79,7 +83,7 @@ def _double(data: bytes) -> float:
 
 def second_opinion(payload: bytes) -> Read | None:
     """What the message says, or None if it must not be accepted, whatever came before."""
-    if len(payload) < 72 or payload[:5] != b"csat\x02" or payload[7] or payload[8:16] != PROBLEM:
+    if len(payload) < 72 or payload[:5] != b"csat\x03" or payload[7] or payload[8:16] != PROBLEM:
         return None
     if crc(payload[:-4]) != _integer(payload[-4:]):
         return None
@@ -111,9 +115,24 @@ def _arrays(data: bytes, count: int, expected: list[Any]) -> list[tuple[tuple[in
         limits = array.largest if isinstance(array.largest, tuple) else (array.largest,)
         if not all(abs(value) <= limits[place % len(limits)] for place, value in enumerate(values[:size])):
             return None
+        if array.sound and not makes_sense(values[:size]):
+            return None
         arrays.append((array.shape, values[:size]))
         del values[:size]
     return arrays
+
+
+def makes_sense(numbers: list[float]) -> bool:
+    """Whether mail is what an agent of sense can have sent; see `LETTER`. The eigenvalues of 2 × 2 are known in closed form."""
+    changes, barrier, _, _, a, b, c, _, _, weight, _, error, proof, _ = numbers
+    scale = max(abs(a), abs(b), abs(c)) or 1.0
+    a, b, c = a / scale, b / scale, c / scale
+    middle, apart = (a + c) / 2, math.hypot((a - c) / 2, b)
+    return (
+        changes >= 0 and changes.is_integer()
+        and (barrier >= 0 or barrier == -1) and (weight >= 0 or weight == -1) and error >= 0 and proof >= 0
+        and middle - apart >= -INDEFINITE * max(middle + apart, 0.0)
+    )  # fmt: skip
 
 
 def agrees(message: Message, read: Read) -> bool:
@@ -145,13 +164,22 @@ class Mutator:
         draw = self.random
         source = draw.choice(list(EXPECTED))
         kind = draw.choice(list(EXPECTED[source]))
-        shapes = [each.shape if isinstance(each, Numbers) else each for each in EXPECTED[source][kind]]
-        arrays = tuple(np.asarray([draw.uniform(-9, 9) for _ in range(math.prod(shape))]).reshape(shape) for shape in shapes)
+        arrays = tuple(self._array(each if isinstance(each, Numbers) else Numbers(each)) for each in EXPECTED[source][kind])
         self.sequence += 1
         echo = draw.choice([math.nan, 12.5])
         message = Message(kind, PROBLEM, source, ME, 1, self.sequence, draw.uniform(0, 99), echo, self.sequence, 5.0, arrays)
         self.last = encode(message)
         return self.last
+
+    def _array(self, expected: Numbers) -> np.ndarray:
+        draw = self.random
+        values = [draw.uniform(-9, 9) for _ in range(math.prod(expected.shape))]
+        if expected.sound:
+            root, side = draw.uniform(0, 3), draw.uniform(-3, 3)
+            values[0], values[1] = float(draw.randrange(5)), draw.choice([-1.0, draw.uniform(0, 9)])
+            values[4:7] = root * root, root * side, side * side + draw.choice([0.0, 1.0])
+            values[9], values[11:13] = draw.choice([-1.0, 0.0, 2.5]), (draw.uniform(0, 1), draw.uniform(0, 9))
+        return np.asarray(values).reshape(expected.shape)
 
     def astray(self) -> bytes:
         """Well-formed, but not for us, or not from whom or of what we expect."""

@@ -96,7 +96,9 @@ def part_text() -> str:
     ("old", "new", "message"),
     [
         ("hops: 2", "hops: -2", "hops: it is -2, but must be greater than or equal to 0"),
-        ("consat-part: 1", "consat-part: 7", "the version is 7, but this consat reads 1"),
+        ("consat-part: 2", "consat-part: 1", "the version is 1, but this consat reads 2; split the scenario again"),
+        ("psi: 0.4", "psi: -0.4", "psi: it is -0.48999999999999994, but must be greater than 0"),
+        ("travels: [a1]", "travels: [a3]", "it must name agents of shares, each once, in their order"),
         ("agent: a2\n", "agent: a9\n", "agent 'a9' is not among the agents of the scenario within"),
         ("length: 1", "length: .nan", "length: it is nan, but must be a finite number"),
         ("degrees: [1]", "degrees: [1, 1]", "it has 2 numbers, but must have one for each of shares"),
@@ -121,7 +123,7 @@ def test_a_bad_part_is_told_by_line_and_column(old: str, new: str, message: str)
     assert all(line.startswith("part.yaml:") for line in str(caught.value).splitlines())
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "consat: 1", "consat-part: 1\nscenario: 3", "\x00"])
+@pytest.mark.parametrize("text", ["", "[1, 2]", "consat: 1", "consat-part: 2\nscenario: 3", "\x00"])
 def test_what_is_no_part_is_refused(text: str) -> None:
     with pytest.raises(InvalidScenario):
         read_part(text, "part.yaml")

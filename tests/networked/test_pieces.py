@@ -225,6 +225,8 @@ def test_a_body_that_is_not_measured_any_more_stands() -> None:
         ({"mode": "admm", "memory": Path("x")}, None, "only lockstep takes a memory file"),
         ({"mode": "admm", "pace": 2.0}, None, "only link takes a pace"),
         ({"mode": "admm"}, "proximal", "mode lockstep runs every protocol in rounds"),
+        ({"mode": "interior-point"}, "admm", "mode lockstep runs every protocol in rounds"),
+        ({"mode": "link"}, "interior-point", "mode link runs the protocol gradient-flow"),
         ({"mode": "lockstep"}, "gradient-flow", "mode lockstep runs protocols in rounds"),
     ],
 )
@@ -275,9 +277,26 @@ def test_an_observer_knows_only_what_all_know() -> None:
     observer = Observer(load("case-c").team, np.zeros((3, 2)), "round")
     for number, agent in itertools.product((1, 2), ("a1", "a2", "a3")):
         observer.take([{"event": "satisfied", "id": agent, "stamp": 10.0 * number}])
-        assert (observer.all_known() is None) == (number == 1 and agent != "a3")
+        known = number == 2 or agent == "a3"
+        assert observer.all_known() == (("satisfied", 10.0) if known else (None, None))
+        assert (observer.concluded() is not None) == known
     observer.take([{"event": "unsatisfied", "id": "a2", "stamp": 30.0}])
-    assert observer.all_known() is None
+    assert observer.all_known() == (None, None)
+    assert observer.concluded() is None
+
+
+def test_an_observer_waits_until_all_know_that_they_are_near_the_best() -> None:
+    observer = Observer(load("case-d").team, np.zeros((3, 2)), "round")
+    for stamp, agent in enumerate(("a1", "a2", "a3")):
+        observer.take([{"event": "infeasible", "id": agent, "stamp": stamp, "near": False, "bound": -0.5, "margin": None}])
+    assert observer.all_known() == ("infeasible", 2)
+    for stamp, agent in enumerate(("a1", "a2", "a3"), 10):
+        assert observer.concluded() is None
+        observer.take([{"event": "infeasible", "id": agent, "stamp": stamp, "near": True, "bound": -0.5, "margin": -0.51}])
+    assert observer.all_known() == ("infeasible", 2)
+    assert observer.concluded() == 12
+    observer.take([{"event": "undecided", "id": "a3", "stamp": 20.0}])  # somebody left
+    assert observer.all_known() == (None, None)
 
 
 def test_the_table_shows_margins_links_and_who_is_down() -> None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.network.core import Embodied, Kept, Moment
+from consat.network.core import Embodied, Kept, Moment, Rows, Turned
 from consat.network.link_core import LinkCore, LinkState
 from consat.network.modes import Manner, Runner
 from consat.network.paced import Paced
@@ -267,14 +267,14 @@ def test_a_body_keeps_to_its_speed_limit() -> None:
 class Naive(LinkCore):
     """The paper's flow sampled naively: each end of a link integrates its own idea of the difference, ż = k1 k2 Σ (x − x̂)."""
 
-    def turn(self, state: LinkState, inbox: np.ndarray, arrived: np.ndarray, moment: Moment) -> tuple[LinkState, np.ndarray, np.ndarray]:
+    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         kept = state.force
-        after, outbox, x = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
+        after, said, x, *_ = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
         integral = kept + self.k1 * self.k2 * moment.elapsed * (self.solver.links.at(after.x) - after.there)
         state = after._replace(force=integral, theirs=-integral, valid=jnp.zeros_like(after.valid))
-        outbox = outbox.copy()
+        outbox = said.link.copy()
         outbox[:, -1] = 0.0  # says nothing of its integral
-        return state, outbox, x
+        return Turned(state, Rows(outbox, said.pair), x)
 
     def among(self, gone: Any) -> "Naive":
         return Naive(self.whole, self.k1, self.k2, gone)

@@ -21,7 +21,11 @@ from consat.errors import NetworkError
 from consat.network.wire import AHEAD, LONGEST, QUIET, SUPPORT, Checker, Kind, Message, Numbers, Reason, claims, encode
 
 PROBLEM = b"problem1"
-EXPECTED = {"a1": {Kind.STATE: [(2,)], Kind.HELLO: []}, "a3": {Kind.STATE: [(1, 2), Numbers((2,), math.inf)]}}
+EXPECTED = {
+    "a1": {Kind.STATE: [(2,)], Kind.HELLO: []},
+    "a3": {Kind.STATE: [(1, 2), Numbers((2,), math.inf)]},
+    "a4": {Kind.STATE: [Numbers((2,), sound=lambda numbers: bool(numbers[0] >= numbers[1]))]},
+}
 
 
 def message(**changes: Any) -> Message:
@@ -44,7 +48,7 @@ def checker(expected: Mapping[str, Any] = EXPECTED, **options: Any) -> Checker:
 def test_bytes_are_as_documented() -> None:
     """Written down by hand: whoever changes the format must change the version."""
     body = (
-        b"csat\x02\x02\x02\x00problem1"
+        b"csat\x03\x02\x02\x00problem1"
         + struct.pack("<QQQ", 3, 2**40, 9)
         + struct.pack("<ddd", 1.5, 0.25, 5.0)
         + b"\x02\x00\x03\x00a1\xc3\xa4x"
@@ -114,7 +118,8 @@ BAD = {
     "a pickle": (pickle.dumps({"x": list(range(99))})[:120], Reason.MAGIC),
     "another program's": (patched(0, b"JSON"), Reason.MAGIC),
     "version 1, which told nothing of bodies": (patched(4, b"\x01"), Reason.VERSION),
-    "version 3": (patched(4, b"\x03"), Reason.VERSION),
+    "version 2, which told nothing to a neighbour as a whole": (patched(4, b"\x02"), Reason.VERSION),
+    "version 4": (patched(4, b"\x04"), Reason.VERSION),
     "a flipped bit": (encode(message())[:-5] + b"\x41" + encode(message())[-4:], Reason.CHECKSUM),
     "a reserved byte": (patched(7, b"\x01"), Reason.HEADER),
     "a stranger": (encode(message(source="a9")), Reason.SOURCE),
@@ -139,6 +144,7 @@ BAD = {
     "x = NaN": (encode(message(arrays=(np.array([0.0, math.nan]),))), Reason.NUMBER),
     "x = −∞": (encode(message(arrays=(np.array([-math.inf, 0.0]),))), Reason.NUMBER),
     "NaN where ∞ may be": (encode(message(source="a3", arrays=(np.zeros((1, 2)), np.array([0.0, math.nan])))), Reason.NUMBER),
+    "numbers that make no sense together": (encode(message(source="a4", arrays=(np.array([1.0, 2.0]),))), Reason.SENSE),
     "∞ in the wrong array": (encode(message(source="a3", arrays=(np.full((1, 2), math.inf), np.zeros(2)))), Reason.NUMBER),
 }
 
@@ -168,6 +174,7 @@ def test_a_name_must_not_run_into_the_checksum() -> None:
 def test_infinity_passes_where_it_is_due() -> None:
     door = checker()
     assert door.accept(encode(message(source="a3", arrays=(np.zeros((1, 2)), np.array([math.inf, -math.inf]))))) is not None
+    assert door.accept(encode(message(source="a4", arrays=(np.array([2.0, 1.0]),)))) is not None
 
 
 def test_largest_is_a_limit_of_each_array() -> None:
