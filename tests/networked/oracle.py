@@ -1,7 +1,7 @@
 """Run as a program, with every product rounded by itself (see `consat.network.environment`): lockstep against `simulate`, to the last bit.
 
-Prints JSON: the trajectory that `simulate` gives, and for each trial over the network in memory by how much the agents' differ from it;
-without trials if an argument says ``truth``.
+Prints JSON: the trajectory that `simulate` gives of case C, and for each trial over the network in memory by how much the agents' differ
+from what it gives; without trials if an argument says ``truth``.
 """
 
 import json
@@ -13,17 +13,29 @@ import numpy as np
 
 import consat as cs
 from consat.network.modes import Manner
-from consat.network.transports.memory import Conditions
-from tests.networked.case_c import rehearse
+from consat.network.part import split
+from consat.network.rehearsal import Rehearsal
+from consat.network.transports.memory import Air, Conditions
+from consat.scenario import load
 
 ROUNDS = 120
+KILLS = ((0.1, "a2"), (0.8, "a1"))
+TRIALS = {
+    "perfect": ("case-c", "interior-point", 0.0, ()), "loss": ("case-c", "interior-point", 0.3, ()),
+    "kills": ("case-c", "interior-point", 0.3, KILLS), "infeasible": ("case-d", "interior-point", 0.0, ()),
+    "infeasible, loss": ("case-d", "interior-point", 0.3, ()), "max-min": ("case-d", "max-min", 0.3, ()),
+    "admm": ("case-c", "admm", 0.3, KILLS),
+}  # fmt: skip
+"""Scenario, protocol, loss, and who is killed when."""
 
 
-def trajectories(loss: float, kills: tuple[tuple[float, str], ...], folder: Path) -> dict[str, dict[int, list[float]]]:
+def trajectories(
+    name: str, protocol: str, loss: float, kills: tuple[tuple[float, str], ...], folder: Path
+) -> dict[str, dict[int, list[float]]]:
     """Of all agents by round, over the network in memory; those to be killed start again half a second later."""
-    manner = Manner("lockstep", turns=ROUNDS, report=0.0)
-    team = rehearse(manner, Conditions(loss=loss, delay=(1e-4, 3e-3), repeat=0.1))
-    team.kill("a1", "a2", "a3")
+    parts = split(load(name, [f"protocol.kind={protocol}"]), run="oracle")
+    conditions = Conditions(loss=loss, delay=(1e-4, 3e-3), repeat=0.1)
+    team = Rehearsal(parts, Manner("lockstep", turns=ROUNDS, report=0.0), Air(conditions))
     for agent in ("a1", "a2", "a3"):  # one after the other, as processes do
         team.start(agent, memory=folder / agent)
         team.run(0.02)
@@ -41,17 +53,19 @@ def trajectories(loss: float, kills: tuple[tuple[float, str], ...], folder: Path
 
 
 def main() -> None:
-    result = cs.run("case-c", rounds=ROUNDS)
-    truth = result.data["position"].values
-    ids = list(result.data["agent"].values)
-    found = {}
-    trials = ("perfect", 0.0, ()), ("loss", 0.3, ()), ("kills", 0.3, ((0.1, "a2"), (0.8, "a1")))
-    for name, loss, kills in () if "truth" in sys.argv else trials:
+    truth, ids, found = None, None, {}
+    for trial, (name, protocol, loss, kills) in TRIALS.items():
+        result = cs.run(name, rounds=ROUNDS, protocol=protocol)
+        positions, agents = result.data["position"].values, list(result.data["agent"].values)
+        if truth is None:
+            truth, ids = positions, agents
+        if "truth" in sys.argv:
+            break
         with tempfile.TemporaryDirectory() as folder:
-            tracks = trajectories(loss, kills, Path(folder))
-        differences = [np.abs(truth[number, ids.index(agent)] - place).max() for agent in ids for number, place in tracks[agent].items()]
-        found[name] = {"rounds": [len(tracks[agent]) for agent in ids], "off": float(max(differences))}
-    json.dump({"truth": truth.tolist(), "ids": ids, "found": found}, sys.stdout)
+            tracks = trajectories(name, protocol, loss, kills, Path(folder))
+        off = [np.abs(positions[number, agents.index(agent)] - place).max() for agent in agents for number, place in tracks[agent].items()]
+        found[trial] = {"rounds": [len(tracks[agent]) for agent in agents], "off": float(max(off))}
+    json.dump({"truth": None if truth is None else truth.tolist(), "ids": ids, "found": found}, sys.stdout)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from consat.network.transports.memory import Air, Conditions
 from consat.numerics import float64
 from consat.scenario import loads
 from tests.networked.case_c import events, off, parts, rehearse
+from tests.networked.oracle import TRIALS
 
 ROOT = Path(__file__).parents[2]
 DELAYS = (0.05, 0.2)
@@ -43,7 +44,7 @@ def arrive(team: Rehearsal, mode: str) -> float:
 
 
 def test_lockstep_equals_simulate_bit_for_bit() -> None:
-    """Through loss, delay and repetition, and through two crashes, each with its memory on disk. In a process of its own, whose compiler
+    """Every protocol, through loss, delay and repetition, and through two crashes, each with its memory on disk. In a process of its own, whose compiler
     rounds every product by itself: with fused multiply-add the last bit depends on what is computed beside it."""
     environment = os.environ | {
         "XLA_FLAGS": "--xla_cpu_max_isa=AVX",
@@ -54,7 +55,7 @@ def test_lockstep_equals_simulate_bit_for_bit() -> None:
     )
     assert done.returncode == 0, done.stderr.decode()[-2000:]
     found = json.loads(done.stdout)["found"]
-    assert found == {name: {"rounds": [120, 120, 120], "off": 0.0} for name in ("perfect", "loss", "kills")}
+    assert found == {name: {"rounds": [120, 120, 120], "off": 0.0} for name in TRIALS}
 
 
 @pytest.mark.parametrize(
