@@ -117,7 +117,9 @@ class Interior:
                 at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
                 Proof(*map(at, inbox.proof)),
             )  # fmt: skip
-            found, mail = step.act(_lanes(batch, units, gains, self.plan.exact), shared, rows < len(y), mine, heard, told[agents], gains)
+            found, mail = step.act(
+                _lanes(batch, units, gains, self.plan.exact), shared, rows < len(y), mine, heard, told=told[agents], gains=gains
+            )
             return _out(found), jax.tree.map(lambda leaf: _widened(leaf, self.plan.width), mail)
 
         found = [turn(batch) for batch in self.plan.batches]

@@ -232,7 +232,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     mine = slot[copies.own]
     slot = np.where(slot == mine[copies.holder], 0, slot + (slot < mine[copies.holder]))
     made = [
-        _made(team, copies, shared, forms, start, slot, _Group(np.flatnonzero(power == one), *(
+        _made(team, copies, shared, forms, start, slot, group=_Group(np.flatnonzero(power == one), *(
             int(values[power == one].max(initial=0)) for values in (held, degree, widest)
         )))
         for one in np.unique(power)
@@ -255,7 +255,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     )  # fmt: skip
 
 
-def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], start: np.ndarray, slot: np.ndarray, group: _Group) -> Batch:
+def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], start: np.ndarray, slot: np.ndarray, *, group: _Group) -> Batch:
     agents, d = group.agents, team.dimension
     place = np.full(team.count, -1)
     place[agents] = np.arange(len(agents))

@@ -337,7 +337,7 @@ def number(mask: Array) -> Array:
     return jnp.sum(mask.astype(float), axis=0)
 
 
-def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, told: Array, gains: Gains) -> tuple[Memory, Mail]:
+def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *, told: Array, gains: Gains) -> tuple[Memory, Mail]:
     """A Newton step on own constraints and the neighbours' quadratics, then a quadratic and a proof for each neighbour.
 
     Args:
@@ -418,7 +418,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
         left, e = left * places[:, :, None] * places[:, None], e * places
     fine &= jnp.isfinite(left).all(axis=(1, 2)) & jnp.isfinite(e).all(axis=1)
     speaks = (some | jnp.isfinite(lowest)) & ~warm
-    proof, bound = prove(lanes, shared, held, y, here, multiplier, inbox.proof)
+    proof, bound = prove(lanes, shared, held, y, here=here, multiplier=multiplier, inbox=inbox.proof)
     behind = _least_of_others(jnp.concatenate([told[None], inbox.margin]))[1:]
     mail = Mail(
         jnp.where(fine[:, None, None], left, 0.0),
@@ -428,10 +428,10 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, t
         behind,
         proof,
     )
-    told = Memory(
+    after = Memory(
         y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(memory.bound, bound), memory.age + 1, inertia, swing, rest
     )
-    return told, mail
+    return after, mail
 
 
 def _least_of_others(numbers: Array) -> Array:
@@ -511,7 +511,7 @@ IDLE = 0.01
 """The part of an agent without constraints in that, whose Σ λ is 0."""
 
 
-def prove(lanes: Lanes, shared: Array, held: Array, y: Array, here: Here, multiplier: Array, inbox: Proof) -> tuple[Proof, Array]:
+def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, multiplier: Array, inbox: Proof) -> tuple[Proof, Array]:
     """The proof for each neighbour, and (A,) a bound on the best margin: max_x Σ λψ / Σ λ over all agents (design, section 9).
 
     A ψ that is not quadratic stands in by its tangent, which is above it everywhere if it is concave. So that no direction is flat, every
