@@ -66,7 +66,7 @@ def _difference(links: Any, x: Array, weight: Array | float) -> Array:
 
 
 def _flow_begin(x: Array, *_: Any) -> Any:
-    return x, jnp.zeros_like(x)
+    return x, 0.0 * x
 
 
 def _flow_round(state: Any, gradient: Callable[[Array], Array], links: Any, step: Array) -> Any:

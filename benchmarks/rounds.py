@@ -190,7 +190,7 @@ def _go_on(protocol: Rounds, world: World, groups: Groups, now: Any, numbers: Ar
     return jax.vmap(one)(now, loss)
 
 
-def _for_good(good: np.ndarray) -> np.ndarray:
+def for_good(good: np.ndarray) -> np.ndarray:
     """(…, T, S) → (…, S): the round from which it stays so (for `HOLD` at least); NaN where it doesn't."""
     rounds = good.shape[-2]
     last_bad = np.where(good.all(axis=-2), -1, rounds - 1 - np.argmax(~good[..., ::-1, :], axis=-2))
@@ -225,10 +225,10 @@ def measure(stage: Stage, name: str, conditions: Sequence[Condition], cap: int, 
         now, (m, s) = _go_on(protocol, world, groups, now, jnp.arange(done, done + CHUNK, dtype=float), loss)
         margins, smooth = np.concatenate([margins, np.asarray(m)], axis=1), np.concatenate([smooth, np.asarray(s)], axis=1)
         done += CHUNK
-        satisfied = _for_good(margins > 0)
+        satisfied = for_good(margins > 0)
         value, target = (margins, stage.best) if name == "max-min" else (smooth, stage.smooth_best)
         near = np.zeros_like(value, dtype=bool) if target is None else value >= target - CLOSE * stage.size.psi
-        optimal = _for_good(near)
+        optimal = for_good(near)
         wanted = problem.convex and (problem.count <= SMALL or name == "max-min")
         if _over(satisfied if problem.feasible else np.zeros(1), optimal[:1] if wanted else np.zeros(1), done):
             break
@@ -268,8 +268,8 @@ def measure_peers(stage: Stage, boxes: Sequence[float], cap: int, steps: np.ndar
             full[0, alive], full[1, alive] = (np.where(np.isfinite(part), part, -np.inf) for part in (m, s))
             margins, smooth = np.concatenate([margins, full[0]], axis=1), np.concatenate([smooth, full[1]], axis=1)
             done += chunk
-            satisfied = _for_good(margins > 0)
-            optimal = _for_good(smooth >= stage.smooth_best - CLOSE * stage.size.psi)
+            satisfied = for_good(margins > 0)
+            optimal = for_good(smooth >= stage.smooth_best - CLOSE * stage.size.psi)
             ok = np.isfinite(full[0][alive, -1]).any(axis=-1)
             keep = np.flatnonzero(ok)
             if done == chunk or len(keep) < len(alive) / 2:  # lanes that overflowed everywhere are out; each new shape is compiled anew
@@ -324,7 +324,7 @@ def _thousands(values: np.ndarray) -> str:
     return f"{np.median(reached):,.0f}".replace(",", " ") if len(reached) else "–"
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "|".join("---" if k == 0 else "--:" for k in range(len(head))) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
@@ -345,7 +345,7 @@ def _ours(stages: Sequence[Stage]) -> str:
             stage.problem.name, str(stage.problem.seeds), *cells,
             _thousands(got[0].floats), _median(got[0].optimal) if stage.problem.convex else "not convex", success,
         ])  # fmt: skip
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _twins(stages: Sequence[Stage]) -> str:
@@ -366,7 +366,7 @@ def _twins(stages: Sequence[Stage]) -> str:
             stage.problem.name, *cells, success,
             _median(exact.optimal), f"{np.mean(np.isfinite(exact.optimal)):.0%}", f"{off:.1e}",
         ])  # fmt: skip
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _others(stages: Sequence[Stage], boxes: Sequence[float]) -> str:
@@ -397,7 +397,7 @@ def _others(stages: Sequence[Stage], boxes: Sequence[float]) -> str:
                 *("–" if np.isnan(r) else f"{r:.0f}" if np.isfinite(r) else "∞" for r in ratios),
                 stage.steps.get(("flow", condition), "") if theirs[0].success else "",
             ])  # fmt: skip
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _ratio(stage: Stage, box: float, of: str = "satisfied", flow: str = "flow") -> float:
@@ -460,10 +460,10 @@ def _targets(stages: Sequence[Stage], compared: Sequence[Stage]) -> str:
         missed = ", ".join(f"{name} {value:.1e}" for name, value in off.items() if not value <= CLOSE)
         text = f"{len(off)} problems; worst {worst}: {off[worst]:.1e}" + (f"; missed: {missed}" if missed else "")
         rows.append(("max-min within 1e-3 of Clarabel on every convex problem (scale of ψ = 1)", text, not missed))
-    return _table(["target", "measured", "met"], [(t, m, "yes" if met else "**no**") for t, m, met in rows])
+    return table(["target", "measured", "met"], [(t, m, "yes" if met else "**no**") for t, m, met in rows])
 
 
-def _machine(command: str, seconds: float) -> str:
+def machine(command: str, seconds: float) -> str:
     packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "numpy", "consat"))
     return (
         f"{datetime.date.today().isoformat()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, {packages}; "
@@ -530,7 +530,7 @@ def main() -> None:
     command = "python benchmarks/rounds.py" + (" --quick" if asked.quick else "")
     asked.out.mkdir(parents=True, exist_ok=True)
     text = PROSE.format(
-        machine=_machine(command, time.perf_counter() - began), ours=_ours(stages), twins=_twins(stages), others=_others(compared, boxes),
+        machine=machine(command, time.perf_counter() - began), ours=_ours(stages), twins=_twins(stages), others=_others(compared, boxes),
         targets=_targets(stages, compared), packages=packages, steps=len(steps), low=steps[0], high=steps[-1],
         cap=caps[0], cap_large=caps[1], cap_peers=caps[2],
     )  # fmt: skip
