@@ -146,14 +146,13 @@ def test_a_step_of_one_agent_is_the_newton_step_of_its_barrier():
     assert np.allclose(moved, part * step[:2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("letter", "cd")
-def test_the_papers_cases_end_at_their_best_margins(letter):
-    talk = Talk(case(letter))
+def test_an_infeasible_case_ends_at_its_best_margin_and_is_proven_to():
+    talk, best = Talk(case("d")), MARGINS["d"]
     talk.begin()
     margins, bounds = talk.run(25)
-    assert margins[-1].min() == pytest.approx(MARGINS[letter], abs=1e-3)
-    assert (bounds[-1] >= MARGINS[letter] - 1e-6).all()
-    assert (bounds[-1] <= MARGINS[letter] + 5e-3).all()
+    assert margins[-1].min() == pytest.approx(best, abs=1e-3)
+    assert (bounds >= best - 1e-5).all()
+    assert (bounds[-1] <= best + 5e-3).all()
 
 
 def tangle(random: np.random.Generator, count: int, prefix: str) -> tuple[list[cs.Agent], list[tuple[str, str]]]:
@@ -258,5 +257,6 @@ def test_a_team_in_millimetres_and_the_same_in_kilometres_take_the_same_rounds()
     for unit in (1e-3, 1e3):
         talk = Talk(case("c", unit=unit))
         talk.begin()
-        found.append(talk.run(12)[0].min(axis=1) / unit**2)
-    assert np.allclose(*found, rtol=1e-6, atol=1e-9)
+        found.append(talk.run(25)[0].min(axis=1) / unit**2)
+    assert np.allclose(*found, rtol=1e-5, atol=1e-7)
+    assert found[0][-1] == pytest.approx(MARGINS["c"], abs=1e-3)

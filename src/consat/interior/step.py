@@ -20,7 +20,7 @@ from consat.scale import Scale
 
 NUDGE = 1e-3
 """Copies begin by this part of the way from the own place to the first estimate, so that no two fall together."""
-WIDER = 0.1
+WIDER = 0.5
 """The same where a ψ is not quadratic: where places coincide norms have a kink, and inverse distances a pole, that one leaves slowly."""
 TRIES = 24
 """Places that are tried, ever farther away, where a ψ is not a number at the start."""
