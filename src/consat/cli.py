@@ -205,9 +205,12 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     loaded = _load(scenario, overrides)
     from consat.central.assumptions import report
     from consat.graphs import require_connected
+    from consat.runs.preparation import told
     from consat.views import tables
 
     findings = report(loaded.team)
+    if findings["communication_connected"]:
+        findings |= told(loaded.team, loaded.settings.protocol)
     if as_json:
         click.echo(json.dumps(findings))
     else:

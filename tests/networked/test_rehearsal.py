@@ -44,8 +44,8 @@ def arrive(team: Rehearsal, mode: str) -> float:
 
 
 def test_lockstep_equals_simulate_bit_for_bit() -> None:
-    """Every protocol, through loss, delay and repetition, and through two crashes, each with its memory on disk. In a process of its own, whose
-    compiler rounds every product by itself: with fused multiply-add the last bit depends on what is computed beside it."""
+    """Every protocol, through loss, delay and repetition, and through two crashes, each with its memory on disk. In a process of its
+    own, whose compiler rounds every product by itself: with fused multiply-add the last bit depends on what is computed beside it."""
     environment = os.environ | {
         "XLA_FLAGS": "--xla_cpu_max_isa=AVX",
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),

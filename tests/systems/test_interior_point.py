@@ -119,7 +119,11 @@ def test_who_conflicts_and_what_would_do_is_said() -> None:
     assert "would do" in said
 
 
-def test_the_default_goes_by_the_size_of_the_team() -> None:
+def test_the_default_goes_by_the_structure_of_the_team() -> None:
     assert cs.run("case-a", rounds=1).summary["protocol"] == "interior-point"
     assert cs.run("convoy", rounds=1).summary["protocol"] == "interior-point"
+    loops = cs.run("lattice", rounds=1).summary
+    assert (loops["protocol"], loops["route"]) == ("interior-point", "links")
+    assert cs.run("lattice", rounds=1, protocol="max-min").summary["route"] == "tree"
+    assert cs.run("swarm", rounds=1).summary["protocol"] == "admm", "not concave, with loops"
     assert cs.run(cs.load("convoy", ["count=30000"]), rounds=1).summary["protocol"] == "admm"

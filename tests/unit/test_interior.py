@@ -91,7 +91,7 @@ class Talk:
 
     def __init__(self, team: cs.Team, protocol: InteriorPoint | None = None, *, along: Any = None):
         self.team, size = team, scale(team)
-        self.route, self.copies = along or route_of(team, "local")
+        self.route, self.copies = along or route_of(team, "local")[:2]
         self.interior = Interior.of(team, self.copies, size)
         self.gains = (protocol or InteriorPoint(cap=None)).gains
         self.own, self.size = self.copies.own, size
@@ -209,12 +209,14 @@ def ring(count: int) -> cs.Team:
 
 def test_loops_narrow_enough_are_cut_open_and_wide_ones_proven_by_nobody(monkeypatch):
     team = ring(6)
-    route, copies = route_of(team, "local")
+    route, copies, _ = route_of(team, "local")
     assert route == "tree"
+    assert route_of(team, "local", exact=False).route == "links"
     assert Interior.of(team, copies, scale(team)).plan.exact
     monkeypatch.setattr("consat.interior.layout.WIDE", 3)
-    route, copies = route_of(team, "local")
+    route, copies, why = route_of(team, "local")
     assert route == "links"
+    assert "more than 3" in why
     talk = Talk(team, along=(route, copies))
     assert not talk.interior.plan.exact
     talk.begin()

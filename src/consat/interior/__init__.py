@@ -14,13 +14,13 @@ from jax import Array
 
 from consat.estimates import Estimates
 from consat.interior import step
-from consat.interior.layout import Batch, Plan, Route, Shared, plan_of, route_of
+from consat.interior.layout import Batch, Plan, Route, Shared, Way, plan_of, route_of
 from consat.interior.step import Gains, Lanes, Mail, Memory, Proof, Units
 from consat.numerics import pick, taken
 from consat.scale import Scale
 from consat.teams.team import Team
 
-__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "Units", "route_of"]
+__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "Units", "Way", "route_of"]
 
 
 @jax.tree_util.register_dataclass

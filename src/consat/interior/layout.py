@@ -191,16 +191,40 @@ WIDE = 40
 """Copies travel along the tree while no message holds more than about this many shared numbers, and along the links beyond."""
 
 
-def route_of(team: Team, layout: Literal["full", "local"]) -> tuple[Route, Estimates]:
-    """Along what the copies of a team travel, and who holds what then. Exact is the tree; it is taken wherever it is narrow enough."""
+class Way(NamedTuple):
+    """Along what the copies of a team travel.
+
+    Attributes:
+        route: along one spanning tree, or along the links.
+        copies: who holds what then.
+        why: this route was taken.
+    """
+
+    route: Route
+    copies: Estimates
+    why: str
+
+
+def route_of(team: Team, layout: Literal["full", "local"], *, exact: bool = True) -> Way:
+    """Along what the copies of a team travel. Along a tree steps are exact and the team proves its bound; along the links of a team with
+    loops a formation that satisfies everybody is found in fewer rounds.
+
+    Args:
+        team: whose clusters are connected.
+        layout: of the estimates.
+        exact: whether to take a spanning tree where there are loops, if it is narrow enough.
+    """
     along_links = Estimates.of(team, layout)
     if len(along_links.links) == _tree_links(along_links):
-        return "tree", along_links
+        return Way("tree", along_links, "the links form a tree")
+    if not exact:
+        return Way("links", along_links, "the links form loops; max-min takes a spanning tree, where it is narrow enough")
     tree = team.with_links(spanning_tree(team.count, along_links.links))
     along_tree = Estimates.of(tree, layout)
-    if int(Shared.of(along_tree).sizes(team.dimension).max(initial=0)) <= WIDE:
-        return "tree", along_tree
-    return "links", along_links
+    width = int(Shared.of(along_tree).sizes(team.dimension).max(initial=0))
+    if width <= WIDE:
+        return Way("tree", along_tree, f"a spanning tree is narrow enough: neighbours share at most {width} numbers")
+    return Way("links", along_links, f"over a spanning tree neighbours would share {width} numbers, more than {WIDE}")
 
 
 ALIKE = 2**19

@@ -14,7 +14,7 @@ from consat.central.certificate import bounds
 from consat.central.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings, counted
 from consat.estimates import Estimates, Layout
-from consat.interior import route_of
+from consat.interior import Way, route_of
 from consat.objective import Schedule
 from consat.protocols import FLOWS, PAIRED, ROUNDS
 from consat.scale import Scale, automatic, scale, start_box
@@ -52,11 +52,21 @@ def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
 
 
 def default_protocol(team: Team, layout: Layout) -> str:
-    """The protocol of a team for which nobody names one: interior-point; admm where its messages would be too wide or too many, and where
-    several processes run one team."""
-    if jax.process_count() > 1 or team.count > MANY or (layout == "full" and team.count > FULL):
-        return "admm"
-    return DEFAULT_PROTOCOL
+    """The protocol of a team for which nobody names one, see `why_admm`."""
+    return DEFAULT_PROTOCOL if why_admm(team, layout) is None else "admm"
+
+
+def why_admm(team: Team, layout: Layout) -> str | None:
+    """Why admm is the default for a team, where interior-point is not."""
+    if jax.process_count() > 1:
+        return "several processes run the team"
+    if team.count > MANY:
+        return f"there are more than {MANY:,} agents, and a round of admm takes less time"
+    if layout == "full" and team.count > FULL:
+        return f"there are more than {FULL} agents of which everybody holds everything, and messages would be too wide"
+    if not shape_of(team).concave.all() and len(team.links) >= team.count:
+        return "some constraints are not concave and the links form loops, where admm takes fewer rounds"
+    return None
 
 
 def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settings:
@@ -83,7 +93,22 @@ def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settin
 def copies_of(team: Team, asked: ProtocolSettings) -> Estimates:
     """Who holds what, as suits a protocol; that of the team where none is named."""
     kind = asked.kind or default_protocol(team, asked.estimates)
-    return route_of(team, asked.estimates)[1] if kind in PAIRED else Estimates.of(team, asked.estimates)
+    return way_of(team, kind, asked.estimates).copies if kind in PAIRED else Estimates.of(team, asked.estimates)
+
+
+def way_of(team: Team, kind: str, layout: Layout) -> Way:
+    """Along what the copies of a team travel with a protocol that speaks to pairs; max-min needs what is exact."""
+    return route_of(team, layout, exact=kind == "max-min")
+
+
+def told(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
+    """Which protocol runs, along what copies travel, and why: of ``run --json`` and ``check --json``."""
+    kind = asked.kind or default_protocol(team, asked.estimates)
+    why = why_admm(team, asked.estimates) if asked.kind is None else None
+    if kind not in PAIRED:
+        return {"protocol": kind, "route": None, "why": why}
+    way = way_of(team, kind, asked.estimates)
+    return {"protocol": kind, "route": way.route, "why": way.why}
 
 
 class Prepared(NamedTuple):

@@ -17,7 +17,7 @@ from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.result import RESULT, Result
-from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
+from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
@@ -213,6 +213,7 @@ def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simula
     options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
     trace = simulate(ready, **options)
     summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
+    summary["route"] = told(team, settings.protocol)["route"]
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)

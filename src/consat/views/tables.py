@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from consat.errors import counted
-from consat.views.words import VERDICT
+from consat.views.words import ROUTE, VERDICT
 
 MOST_ROWS = 30
 """Of longer lists only the beginning is shown."""
@@ -42,6 +42,9 @@ def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield f"  … and {len(constraints) - MOST_ROWS} more; --json lists all"
     facts = ("convex", "convex"), ("one optimum", "unique_optimum"), ("bounded", "bounded")
     yield "   ".join(f"{words}: {ANSWER[findings[key]]}" for words, key in facts)
+    if "protocol" in findings:
+        route = "" if findings["route"] is None else f", along {ROUTE[findings['route']]}"
+        yield f"protocol: {findings['protocol']}{route}" + (f" ({findings['why']})" if findings["why"] else "")
     for assumption in findings["assumptions"]:
         yield f"Assumption {assumption['number']}: {ANSWER[assumption['holds']]}. {escape(assumption['what'])}"
         if assumption["cure"]:

@@ -30,6 +30,8 @@ KNOWN = {
     "satisfied": "each that every constraint holds",
     "infeasible": "each that the constraints cannot all hold, by a proof of the team's own",
 }
+ROUTE = {"tree": "a tree", "links": "the links"}
+"""Along what copies travel."""
 BEST = "max-min"
 """The protocol that ends at the best margin."""
 VERDICT = {
@@ -131,7 +133,8 @@ def _advice(summary: Mapping[str, Any]) -> str | None:
 
 
 def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
+    route = f" along {ROUTE[summary['route']]}" if summary.get("route") else ""
+    yield "protocol", f"{summary['protocol']}{route}, {summary['estimates']} estimates, seed {summary['seed']}"
     units = ("rounds", "round", "rounds"), ("messages", "message", "messages"), ("floats_sent", "number sent", "numbers sent")
     effort = [counted(summary[key], *unit) for key, *unit in units if summary.get(key) is not None]
     if summary.get("time") is not None:
