@@ -11,6 +11,8 @@ from consat.scenario import load
 GOAL = {"a1": (1.10541, 0.0), "a2": (-0.49880, 0.0), "a3": (-1.10541, 0.0)}
 """Where the smooth margin is largest, to 1e-5 (NETWORK.md, MATH.md; `consat run` agrees)."""
 
+ADMM = ("protocol.kind=admm",)
+
 
 def parts(*overrides: str, absent: tuple[str, ...] = ()) -> dict[str, Part]:
     return split(load("case-c", overrides), run="rehearsal", absent=absent)
@@ -23,8 +25,8 @@ def off(rehearsal: Rehearsal) -> float:
 
 
 def rehearse(manner: Manner, conditions: Conditions | None = None, seed: int = 0, **options: object) -> Rehearsal:
-    """All three agents, started."""
-    made = Rehearsal(parts(), manner, Air(conditions, seed), **options)  # type: ignore[arg-type]
+    """All three agents, started; in lockstep they run admm."""
+    made = Rehearsal(parts(*ADMM if manner.mode == "lockstep" else ()), manner, Air(conditions, seed), **options)  # type: ignore[arg-type]
     made.start()
     return made
 

@@ -32,6 +32,7 @@ from tests.networked.case_c import events, parts, rehearse
 SPEED = 0.5
 MODES = {
     "admm": Manner("admm", report=0.0),
+    "interior-point": Manner("interior-point", report=0.0),
     "link": Manner("link", pace=20.0, report=0.0),
     "lockstep": Manner("lockstep", rate=100.0, report=0.0),
 }

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from consat.network import guard
-from consat.network.core import Moment, RoundCore
+from consat.network.core import Moment, RoundCore, Rows
 from consat.network.lockstep import Lockstep
 from consat.network.membership import MOST, Membership
 from consat.network.modes import Manner, core_of
@@ -127,20 +127,22 @@ def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_ot
     """The checker refuses infinite penalties before; whatever it may overlook, the state stays finite."""
     core = core_of(parts()["a2"], Manner("admm"))
     state = core.begin(core.part.first)
-    inbox = np.abs(np.random.default_rng(0).normal(size=(len(core.ends), core.width)))  # penalties are positive
-    arrived = np.ones(len(core.ends), dtype=bool)
-    moment = Moment(0.0, 0.01, np.zeros(len(arrived)), arrived, np.zeros(2))
+    inbox, arrived = core.empty()
+    inbox.link[:] = np.abs(np.random.default_rng(0).normal(size=inbox.link.shape))  # penalties are positive
+    arrived.link[:] = arrived.pair[:] = True
+    moment = Moment(0.0, 0.01, np.zeros(len(arrived.link)), arrived.link, np.zeros(2))
     good = guard.turn(core, state, inbox, arrived, moment)
     assert good.refused == ()
     np.testing.assert_array_equal(good.look.x, core.turn(state, inbox, arrived, moment)[2].x)
     from_a1 = np.array([neighbour == "a1" for neighbour, _ in core.ends])
+    without = Rows(np.where(from_a1[:, None], 0.0, inbox.link), inbox.pair), Rows(~from_a1, arrived.pair)
     for poison in (math.inf, math.nan, -math.inf):
-        spoilt = np.where(from_a1[:, None], poison, inbox)
+        spoilt = inbox._replace(link=np.where(from_a1[:, None], poison, inbox.link))
         assert not np.isfinite(core.turn(state, spoilt, arrived, moment)[2].x).all(), "negative control"
         got = guard.turn(core, state, spoilt, arrived, moment)
         assert got.refused == ("a1",)
-        np.testing.assert_array_equal(got.look.x, core.turn(state, np.where(from_a1[:, None], 0.0, inbox), ~from_a1, moment)[2].x)
-        everything = guard.turn(core, state, np.full_like(inbox, poison), arrived, moment)
+        np.testing.assert_array_equal(got.look.x, core.turn(state, *without, moment)[2].x)
+        everything = guard.turn(core, state, inbox._replace(link=np.full_like(inbox.link, poison)), arrived, moment)
         assert everything.refused == ("a1", "a3")
         assert np.isfinite(everything.look.x).all()
 

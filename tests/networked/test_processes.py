@@ -67,7 +67,11 @@ def off(heard: list[Event]) -> float:
 
 def test_launch_gathers_a_result_as_any_run() -> None:
     done = subprocess.run(
-        [*CONSAT, "launch", "case-c", "--loss", "0.3", "--json"], capture_output=True, text=True, timeout=START, check=False
+        [*CONSAT, "launch", "case-c", "--mode", "admm", "--loss", "0.3", "--json"],
+        capture_output=True,
+        text=True,
+        timeout=START,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -78,6 +82,19 @@ def test_launch_gathers_a_result_as_any_run() -> None:
     assert result["network"]["loss"] == pytest.approx(0.3, abs=0.2)
     assert 0 < result["network"]["known_from"] < result["time"]
     assert result["satisfied_from"]["time"] <= result["network"]["known_from"] + 0.1  # who knows is right, up to a sample
+
+
+def test_launch_ends_when_every_agent_knows_that_not_all_can_be_satisfied() -> None:
+    """In the default mode: proven by themselves, and near the best that there is."""
+    done = subprocess.run(
+        [*CONSAT, "launch", "case-d", "--loss", "0.3", "--json"], capture_output=True, text=True, timeout=START, check=False
+    )
+    assert done.returncode == 4, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["protocol"], result["mode"], result["known"]) == ("interior-point", "interior-point", "infeasible")
+    assert (result["status"], result["verdict"], result["ending"]) == ("least-violating", "infeasible", "settled")
+    assert result["margin"] == pytest.approx(-0.0814394, rel=0.05)
+    assert 0 < result["network"]["known_from"] < result["time"]
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +139,7 @@ def test_lockstep_equals_simulate_bit_for_bit(loss: float, kills: tuple[str, ...
 
 def test_a_crash_is_noticed_at_once_and_mended_without_memory() -> None:
     heard: list[Event] = []
-    with Fleet(parts(), ["--loss", "0.3"]) as fleet:
+    with Fleet(parts(), ["--mode", "admm", "--loss", "0.3"]) as fleet:
         for agent in GOAL:
             fleet.start(agent)
         listen(fleet, heard, lambda: off(heard) < 1e-3, START)

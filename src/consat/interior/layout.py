@@ -122,11 +122,13 @@ class Shared:
         pairs: (P, 2) directed pairs (agent, neighbour), sorted.
         pair: (S,) which pair, in order, …
         row: (S,) … shares which of the agent's rows, in the order of positions; −1 for the level, which comes last.
+        exact: see `Plan`.
     """
 
     pairs: np.ndarray
     pair: np.ndarray
     row: np.ndarray
+    exact: bool
 
     @classmethod
     def of(cls, copies: Estimates) -> Shared:
@@ -142,7 +144,8 @@ class Shared:
         position = np.concatenate([copies.position[here], np.full(len(level), count)])
         row = np.concatenate([here, np.full(len(level), -1)])
         order = np.lexsort((position, pair))
-        return cls(np.stack(np.divmod(pairs, max(count, 1)), axis=1).astype(np.int32), pair[order], row[order])
+        directed = np.stack(np.divmod(pairs, max(count, 1)), axis=1).astype(np.int32)
+        return cls(directed, pair[order], row[order], len(pairs) == 2 * _tree_links(copies))
 
     @property
     def level(self) -> np.ndarray:
@@ -275,7 +278,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        jnp.asarray(floats), int(size.max(initial=1)), len(shared.pairs) == 2 * _tree_links(copies),
+        jnp.asarray(floats), int(size.max(initial=1)), shared.exact,
     )  # fmt: skip
 
 

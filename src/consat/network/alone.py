@@ -118,7 +118,8 @@ def _interior(part: Part) -> Interior:
     one.ids = (part.me,)
     copies = Estimates("local", np.zeros_like(number), number, me, none, np.zeros(1, dtype=np.int32), none)
     units = Units(*(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length)))
-    return Interior.alone(one, copies, Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int)), units)
+    shared = Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int), part.exact)
+    return Interior.alone(one, copies, shared, units)
 
 
 def ends(part: Part) -> list[tuple[str, str]]:

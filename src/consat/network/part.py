@@ -74,6 +74,7 @@ class _File(Model):
     center: tuple[Number, ...]
     reach: Gain
     convex: bool
+    exact: bool
     hops: Annotated[int, Field(ge=0, le=10**6)]
     first: dict[Word, tuple[Number, ...]]
     absent: tuple[Word, ...] = ()
@@ -95,6 +96,7 @@ class Part:
         center: (d,) the team's middle.
         reach: how far around it the team's places are; see `consat.scale.Region`.
         convex: whether every ψ of the team is proven concave.
+        exact: whether what agents share travels along trees, so that proofs can be told; see `consat.interior.layout.Plan`.
         hops: links that a message crosses, at most, from one agent to another.
         team: a team in which it alone has constraints; the others are the agents whose positions it holds.
         settings: protocol and smoothing.
@@ -112,6 +114,7 @@ class Part:
     center: np.ndarray
     reach: float
     convex: bool
+    exact: bool
     hops: int
     team: Team
     settings: Settings
@@ -133,7 +136,7 @@ class Part:
         settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
             "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "psi": self.psi,
-            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex,
+            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex, "exact": self.exact,
             "settings": settings,
         }  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
@@ -272,7 +275,7 @@ def split(
                 )
             )
         parts[agent] = Part(
-            scenario.name, run, agent, listen[owner], size.length, size.psi, size.center, size.reach, bool(concave.all()), across,
+            scenario.name, run, agent, listen[owner], size.length, size.psi, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
         )  # fmt: skip
     return parts
@@ -301,6 +304,7 @@ def write_part(part: Part) -> str:
             "center": part.center.tolist(),
             "reach": part.reach,
             "convex": part.convex,
+            "exact": part.exact,
             "hops": part.hops,
             "first": {agent: row.tolist() for agent, row in zip(part.team.ids, part.first, strict=True)},
             "absent": sorted(part.absent),
@@ -347,7 +351,7 @@ def read_part(text: str, file: str) -> Part:
         raise document.invalid(faults)
     return Part(
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
-        frame.reach, frame.convex, frame.hops, team, settings,
+        frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
         np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
     )  # fmt: skip
 
