@@ -34,10 +34,10 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def parts() -> dict[str, Part]:
+def parts(name: str = "case-c") -> dict[str, Part]:
     ports = free_ports(3)
     addresses = {agent: f"tcp/127.0.0.1:{port}" for agent, port in zip(GOAL, ports, strict=True)}
-    return split(load("case-c"), run=f"test-{os.getpid()}-{ports[0]}", addresses=addresses)
+    return split(load(name), run=f"test-{os.getpid()}-{ports[0]}", addresses=addresses)
 
 
 def listen(fleet: Fleet, heard: list[Event], until: Callable[[], bool], seconds: float) -> None:
@@ -95,6 +95,21 @@ def test_launch_ends_when_every_agent_knows_that_not_all_can_be_satisfied() -> N
     assert (result["status"], result["verdict"], result["ending"]) == ("least-violating", "infeasible", "settled")
     assert result["margin"] == pytest.approx(-0.0814394, rel=0.05)
     assert 0 < result["network"]["known_from"] < result["time"]
+
+
+def test_agents_end_by_themselves_when_they_know_all_that_there_is_to_find() -> None:
+    """Each lingers, so that the others learn what it knows."""
+    heard: list[Event] = []
+    with Fleet(parts("case-d"), ["--stop", "satisfied", "--loss", "0.3"]) as fleet:
+        for agent in GOAL:
+            fleet.start(agent)
+        listen(fleet, heard, lambda: all(last(heard, agent, "end") for agent in GOAL), START)
+    assert {event["why"] for event in heard if event["event"] == "end"} == {"infeasible"}
+    for agent in GOAL:
+        told = last(heard, agent, "infeasible")
+        assert told is not None
+        assert told["near"]
+        assert -0.0814394461 <= told["bound"] < 0 and told["margin"] == pytest.approx(-0.0814394, rel=0.06)  # noqa: PT018
 
 
 @pytest.fixture(scope="module")

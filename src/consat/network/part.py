@@ -92,7 +92,7 @@ class Part:
         me: the agent.
         listen: its own address.
         length: the team's unit of length.
-        psi: the team's unit of ψ.
+        psi: the team's unit of ψ; see `consat.interior.Units`.
         center: (d,) the team's middle.
         reach: how far around it the team's places are; see `consat.scale.Region`.
         convex: whether every ψ of the team is proven concave.
@@ -226,7 +226,7 @@ def split(
     """
     from consat.central.quadratics import shape_of
     from consat.graphs import hops
-    from consat.interior import Shared
+    from consat.interior import Shared, Units
     from consat.objective import Schedule
     from consat.runs.preparation import DEFAULT_PROTOCOL, copies_of, default_protocol, first_estimates
     from consat.scale import automatic, scale
@@ -250,7 +250,7 @@ def split(
     listen = [addresses.get(agent, f"tcp/127.0.0.1:{port + i}") for i, agent in enumerate(team.ids)]
     degree = np.bincount(copies.edges[:, 0], minlength=copies.count)
     run = run or f"{_word(scenario.name)}-{hashlib.sha256(scenario.text.encode()).hexdigest()[:12]}"
-    across = hops(team.count, copies.links)
+    across, unit = hops(team.count, copies.links), float(Units.of(size).psi)
     shared = Shared.of(copies)
     pair_of = {(int(here), int(there)): k for k, (here, there) in enumerate(shared.pairs)}
     rows_of = np.split(shared.row, np.searchsorted(shared.pair, np.arange(1, max(len(shared.pairs), 1))))
@@ -275,7 +275,7 @@ def split(
                 )
             )
         parts[agent] = Part(
-            scenario.name, run, agent, listen[owner], size.length, size.psi, size.center, size.reach, bool(concave.all()), shared.exact, across,
+            scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
         )  # fmt: skip
     return parts
