@@ -74,7 +74,7 @@ def made(
     estimate = x[:, held] * (1 + 0.1 * holder[:, None]) if copies else None
     trace = Trace(
         clock, steps, x, 0 * x, margin, smooth, own, estimate, None if estimate is None else 0.5 * estimate, holder, held,
-        np.zeros(count, dtype=int), "settled", since, None, None, None, {"compile": 0.0, "run": 0.0},
+        np.zeros(count, dtype=int), "settled", since, None, None, None, None, {"compile": 0.0, "run": 0.0},
     )  # fmt: skip
     entries = {
         agent: {
