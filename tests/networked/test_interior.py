@@ -97,6 +97,14 @@ def test_survives_a_crash_without_memory_and_a_partition(name: str, what: str) -
     assert_no_false_word(team, name)
 
 
+def test_one_without_neighbours_knows_by_itself() -> None:
+    lines = "{kind: within, center: [0, 0], radius: 1}, {kind: within, center: [4, 0], radius: 1}"
+    team = Rehearsal(split(loads(f"consat: 1\nagents:\n  - {{id: a, constraints: [{lines}]}}\n"), run="solo"), MANNER, Air())
+    team.start()
+    wait(team, "infeasible")
+    assert min(bounds(team)) >= -3.0  # halfway, 1 − 2²
+
+
 @pytest.mark.parametrize("how", ["leave", "give-up"])
 def test_a_proof_ends_with_the_team_that_it_is_of(how: str) -> None:
     """a3 makes case D infeasible. When it has gone, a1, which holds no copy of its position, and is not told that it has, must forget

@@ -9,6 +9,7 @@ A message has the same length whoever is there; what belongs to those who have g
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -136,7 +137,8 @@ class Packing:
             jnp.broadcast_to(changes, (count,)), mail.barrier, mail.level, mail.margin, proof.weight, proof.constant, proof.error,
             mail.matrix, mail.vector, proof.matrix, proof.vector,
         )  # fmt: skip
-        flat = jnp.concatenate([*(leaf.reshape(count, -1) for leaf in leaves), jnp.zeros((count, 1))], axis=1)
+        rows = [leaf.reshape(count, math.prod(leaf.shape[1:])) for leaf in leaves]
+        flat = jnp.concatenate([*rows, jnp.zeros((count, 1))], axis=1)
         return jnp.take_along_axis(flat, self.out, axis=1)
 
     def unpack(self, packed: Array, width: int) -> tuple[Array, Mail]:
