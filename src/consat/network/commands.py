@@ -265,7 +265,7 @@ def _part(file: str, agent: str, overrides: tuple[str, ...], port: int, mode: An
     loaded = load(file, overrides)
     if agent not in loaded.team.ids:
         raise InvalidSettings(f"there is no agent {agent!r}{closest(agent, loaded.team.ids)}")
-    if mode is not None:
+    if mode not in (None, "lockstep"):
         loaded = _with(loaded, protocol_of(mode, loaded.settings.protocol.kind), None, None)
     with located(loaded):
         return split(loaded, port=port, only=agent)[agent]

@@ -22,12 +22,13 @@ from consat.numerics import float64
 from consat.objective import Schedule
 from consat.protocols import ROUNDS
 from consat.result import Result
-from consat.runs.preparation import copies_of
+from consat.runs.preparation import copies_of, default_protocol
 from consat.runs.summary import summarise
 from consat.scale import automatic, scale
 from consat.scenario import Scenario
 from consat.settings import Settings
 from consat.simulate.rounds import HOLD, SETTLED
+from consat.teams.team import Team
 from consat.trace import Ending
 
 PATIENCE: Final = 600.0
@@ -107,7 +108,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         NetworkError: an agent's process failed.
     """
     team = scenario.team
-    settings = _settings(scenario.settings, plan.mode)
+    settings = _settings(team, scenario.settings, plan.mode)
     scenario = replace(scenario, settings=settings)
     ports = free_ports(team.count)
     addresses = {agent: f"tcp/127.0.0.1:{port}" for agent, port in zip(team.ids, ports, strict=True)}
@@ -131,9 +132,10 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
-def _settings(asked: Settings, mode: Mode) -> Settings:
-    """The protocol that runs is the mode's own, unless the scenario asks for one."""
-    return asked.model_copy(update={"protocol": asked.protocol.model_copy(update={"kind": protocol_of(mode, asked.protocol.kind)})})
+def _settings(team: Team, asked: Settings, mode: Mode) -> Settings:
+    """The protocol that runs is the mode's own, unless the scenario asks for one; in lockstep it is that of `run`."""
+    kind = asked.protocol.kind or (default_protocol(team, asked.protocol.estimates) if mode == "lockstep" else None)
+    return asked.model_copy(update={"protocol": asked.protocol.model_copy(update={"kind": protocol_of(mode, kind)})})
 
 
 @dataclass(frozen=True)
