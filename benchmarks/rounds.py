@@ -36,7 +36,8 @@ from consat.central.reference import cluster_margins, max_min
 from consat.estimates import Estimates
 from consat.numerics import Groups, float64, quick_compilation
 from consat.objective import Nu, Objective, Schedule
-from consat.protocols import ROUNDS, Rounds
+from consat.protocols import PAIRED, ROUNDS, Rounds
+from consat.runs.preparation import way_of
 from consat.scale import Scale, automatic, scale
 from consat.simulate.kernel import Weather, World, begin, many_rounds, world_of
 from consat.simulate.rounds import HOLD
@@ -132,19 +133,25 @@ class Stage:
             center, smooth = _best_smooth(problem, copies.cluster, nu, optimum.positions)
         return cls(problem, copies, nu, size, copies.cluster, best, smooth, center)
 
-    def world(self, *, rough: bool) -> World:
+    def world(self, *, rough: bool, protocol: Rounds, copies: Estimates) -> World:
         weather = Weather(loss=0.5 if rough else 0.0)
-        return world_of(self.problem.team, self.copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None)
+        return world_of(
+            self.problem.team, copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None, speaks=protocol.speaks
+        )
+
+    def layout(self, name: str) -> Estimates:
+        """Who holds what with a protocol."""
+        return way_of(self.problem.team, name, "local").copies if name in PAIRED else self.copies
 
     def copies_sent(self) -> np.ndarray:
         """(S,) positions sent in a round, in each instance."""
         return np.bincount(self.cluster[self.copies.holder[self.copies.edges[:, 0]]], minlength=self.problem.seeds)
 
-    def first(self, box: float, seed: int) -> np.ndarray:
+    def first(self, box: float, seed: int, copies: Estimates | None = None) -> np.ndarray:
         """(C, d) first estimates, uniform in ±box, or for a box of `NEAR` that far around the optimum."""
-        random = np.random.default_rng([seed, int(box)])
-        drawn = random.uniform(-box, box, (self.copies.count, self.problem.team.dimension))
-        return drawn + self.center[self.copies.position] if box == NEAR and self.center is not None else drawn
+        copies, random = copies or self.copies, np.random.default_rng([seed, int(box)])
+        drawn = random.uniform(-box, box, (copies.count, self.problem.team.dimension))
+        return drawn + self.center[copies.position] if box == NEAR and self.center is not None else drawn
 
 
 def _best_smooth(problem: Problem, cluster: np.ndarray, nu: Nu, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -212,12 +219,12 @@ def measure(stage: Stage, name: str, conditions: Sequence[Condition], cap: int, 
         for condition in conditions:
             measure(stage, name, [condition], cap, seed)
         return
-    protocol, problem = ROUNDS[name](), stage.problem
-    world = stage.world(rough=name == "admm")
+    protocol, problem, copies = ROUNDS[name](), stage.problem, stage.layout(name)
+    world = stage.world(rough=name in ("admm", "interior-point"), protocol=protocol, copies=copies)
     groups = Groups.of(stage.cluster, problem.seeds)
-    first = np.stack([stage.first(c.box, seed) for c in conditions])
+    first = np.stack([stage.first(c.box, seed, copies) for c in conditions])
     loss = jnp.asarray([c.loss for c in conditions])
-    looked = [jax.jit(jax.vmap(lambda x: _look(world.observer, groups, stage.nu, x)))(jnp.asarray(first[:, stage.copies.own]))]
+    looked = [jax.jit(jax.vmap(lambda x: _look(world.observer, groups, stage.nu, x)))(jnp.asarray(first[:, copies.own]))]
     margins, smooth = (np.asarray(part)[:, None] for part in looked[0])
     now = _start(protocol, world, jnp.asarray(first), jax.random.split(jax.random.key(seed), len(conditions)))
     done = 0
@@ -232,9 +239,10 @@ def measure(stage: Stage, name: str, conditions: Sequence[Condition], cap: int, 
         wanted = problem.convex and (problem.count <= SMALL or name == "max-min")
         if _over(satisfied if problem.feasible else np.zeros(1), optimal[:1] if wanted else np.zeros(1), done):
             break
-    floats = stage.copies_sent() * {"admm": 2 * problem.team.dimension + 1, "max-min": 2 * problem.team.dimension + 2}.get(
-        name, problem.team.dimension
-    )
+    floats = stage.copies_sent() * (2 * problem.team.dimension + 1 if name == "admm" else problem.team.dimension)
+    if world.everyone.interior is not None:
+        talker, sizes = np.asarray(world.everyone.interior.talker), np.asarray(world.everyone.interior.plan.floats)
+        floats = np.bincount(stage.cluster[talker], weights=sizes, minlength=problem.seeds)
     for k, condition in enumerate(conditions):
         stage.results[name, condition] = Measured(satisfied[k], optimal[k], satisfied[k] * floats, done, margins[k, -1])
     if name == "admm" and not problem.feasible and not stage.verdict:
@@ -566,9 +574,7 @@ def run(
                 measure(stage, "proximal", clear, cap)
                 say("  proximal")
             if count <= 100 and problem.convex and not (quick and count > 3):
-                protocol = ROUNDS["max-min"]()
-                last = protocol.earliest(stage.world(rough=False).everyone)
-                measure(stage, "max-min", clear[:1], last + 200)
+                measure(stage, "max-min", clear[:1], 400)
                 say("  max-min")
             stages.append(stage)
             if count <= (3 if quick else 10) or (family.name == "chain" and count <= 30):
