@@ -23,7 +23,7 @@ from consat.settings import ProtocolSettings, Settings, Start
 from consat.teams.team import Team
 
 DEFAULT_PROTOCOL = "interior-point"
-MANY = 20_000
+MANY = 5000
 """Teams of more agents than these run admm where nobody says: its rounds take less time."""
 FULL = 30
 """Likewise teams of more agents than these where everybody holds everything."""

@@ -29,6 +29,8 @@ ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
 """What all must know for a run to end, for each stop rule."""
 WORD = 10
 """Where agents tell each other of their bodies, a satisfied team goes on until all know it, for at most so many rounds a hop more."""
+FAR = 50
+"""Across more hops than these nobody waits for word to get around."""
 HOLD = 10
 """How many rounds on end every margin must stay positive before a team counts as satisfied."""
 PATIENCE = 2000
@@ -102,7 +104,8 @@ def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> flo
 
 def longest_hold(protocol: Rounds, world: World) -> int:
     """How many rounds on end a team may be satisfied before its run ends, though not all know it."""
-    return HOLD + (WORD * (1 + world.everyone.hops) if protocol.speaks == "pair" else 0)
+    hops = world.everyone.hops
+    return HOLD + (WORD * (1 + hops) if protocol.speaks == "pair" and hops <= FAR else 0)
 
 
 @float64
