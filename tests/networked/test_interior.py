@@ -130,6 +130,27 @@ def test_a_proof_ends_with_the_team_that_it_is_of(how: str) -> None:
     assert min(bounds(team)) >= BEST["case-d"]
 
 
+@float64
+def test_a_proof_of_another_team_is_not_used() -> None:
+    """Of a message that was on its way when the team changed, the quadratic counts, but not the proof, nor what was proven before."""
+    team = team_of("case-d")
+    team.start()
+    wait(team, "infeasible")
+    station, state = team.runners["a1"].station, team.runners["a1"]._state  # type: ignore[attr-defined]
+    last = station.peers.all["a2"].last
+    assert last is not None
+    inbox, arrived = station.core.empty()
+    station.sort("a2", last.arrays, inbox, arrived)
+    assert arrived.pair.tolist() == [True]
+    found = {}
+    for mine, theirs in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)):
+        inbox.pair[0, 0] = theirs
+        changed = state._replace(core=state.core._replace(changes=np.array(mine), bounds=np.full(2, np.inf)))
+        found[mine, theirs] = station.core.turn(changed, inbox, arrived, moment(station.core))[2].bound
+    assert found[1.0, 0.0] == math.inf
+    assert found[0.0, 0.0] == found[1.0, 1.0] == found[0.0, 1.0] == pytest.approx(BEST["case-d"], rel=0.05)
+
+
 def test_one_that_was_absent_joins() -> None:
     team = team_of("case-d", Conditions(loss=0.3), absent=("a3",))
     team.start("a1", "a2")

@@ -78,12 +78,13 @@ def run_agent(part: Part, manner: Manner, around: Circumstances) -> None:
     """
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    core, dimension = core_of(part, manner), part.team.dimension
+    dimension = part.team.dimension
     measured = MeasuredBody(around.speed, around.sensor_timeout) if around.sensor == "stdin" else None
     body = SimulatedBody(_start(part, around), around.speed) if measured is None else measured
     orders = Orders(None if measured is None else dimension, reading=around.attached or measured is not None)
     with heeding_signals(orders):
         helm = Helm(part.me, dimension, measured, around.sensor_timeout, _write)
+        core = core_of(part, manner)
         _warm(core)
         with _transport(part, manner, around) as transport:
             runner = runner_of(
