@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.constraints.curvature import expand
+from consat.constraints.domain import HUGE
 from consat.numerics import float64, once
 from consat.settings import Smoothing
 from consat.teams.family import Family
@@ -25,6 +26,10 @@ SHARPNESS = 5.0
 """ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
 MARGIN = 4.0
 """How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
+STRAIGHT = 1e-6
+"""Of a ψ that is not quadratic, a curvature below this part of its largest is none."""
+FLATTER = 0.5
+"""A step that is said to lead to where ψ is stationary must leave at most this part of its slope."""
 RIM, ROOM = 0.1, 1.0
 """How much farther out than the team's places, at most, estimates from far away begin: of a convex team, and of one that is not, where
 agents need room to find a way around one another."""
@@ -106,29 +111,27 @@ def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
     return size.center - size.reach, size.center + size.reach
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _second_order(
-    psi: Callable[..., Any], arity: int, dimension: int, members: int, parameters: dict[str, jax.Array]
+    psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, jax.Array], at: jax.Array
 ) -> tuple[jax.Array, ...]:
+    """(M,) values, (M, n) gradients and (M, n, n) Hessians at (M, n) places, n = arity·d."""
+
     def flat(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
         return psi(*x.reshape(arity, dimension), **parameters)
 
-    def both(parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
-        origin = jnp.zeros(arity * dimension)
-        return (*jax.value_and_grad(flat)(origin, parameters), jax.hessian(flat)(origin, parameters))
+    def both(x: jax.Array, parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
+        return (*jax.value_and_grad(flat)(x, parameters), jax.hessian(flat)(x, parameters))
 
-    return jax.vmap(both, axis_size=members)(parameters)
+    return jax.vmap(both)(at, parameters)
 
 
 def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Scale, ‖H‖ and slope of each member, and the stationary points of those that read one agent alone."""
-
     try:
         value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
-    except ValueError:  # beyond degree 2: to second order about the origin
-        value, b, hessian = (
-            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, family.size, dict(family.parameters))
-        )
+    except ValueError:
+        return _measure_any(family, dimension)
     hessian = once(hessian)
     finite = np.isfinite(hessian).all(axis=(1, 2))
     usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & finite
@@ -139,3 +142,24 @@ def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np
     psi_there = np.abs(value + 0.5 * np.einsum("mi,mi->m", b, stationary)) * family.weight
     centers = stationary[(bend > 0)] if family.arity == 1 else np.zeros((0, dimension))
     return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers
+
+
+def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The same beyond degree 2: by one step of Newton from the origin, which says something where it leads to where ψ is flatter.
+    Elsewhere ψ is as good as straight, and has its slope at the origin."""
+
+    def look(at: np.ndarray) -> tuple[np.ndarray, ...]:
+        value, slope, hessian = (
+            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters), jnp.asarray(at))
+        )
+        usable = (np.abs(value) <= HUGE) & (np.abs(slope) <= HUGE).all(axis=1) & (np.abs(hessian) <= HUGE).all(axis=(1, 2))
+        return usable, *(np.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in (value, slope, hessian))
+
+    usable, _, slope, hessian = look(np.zeros((family.size, family.arity * dimension)))
+    stationary = -np.matmul(np.linalg.pinv(hessian, STRAIGHT, hermitian=True), slope[..., None])[..., 0]
+    there, value, flatter, hessian = look(stationary)
+    steep = np.linalg.norm(slope, axis=1)
+    curved = usable & there & (np.linalg.norm(flatter, axis=1) <= FLATTER * steep)
+    bend = np.where(curved, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
+    centers = stationary[bend > 0] if family.arity == 1 else np.zeros((0, dimension))
+    return np.abs(value) * family.weight, bend * family.weight, steep * family.weight, centers
