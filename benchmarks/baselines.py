@@ -49,6 +49,8 @@ SWEEP_GAINS = tuple(itertools.product((0.5, 0.3, 0.1), (0.7, 0.9, 0.99)))
 SWEEP_STEPS = 60
 SWEEP_FLOOR = 1e-8
 """Of the barrier, relative to the level: below that nothing is gained, and digits are lost."""
+SWEEP_INERTIA = 1e-9
+"""κ: of an agent that nothing binds, the step is not defined without."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,7 @@ def _longest(slack: Floats, slope: Floats, bend: Floats, part: Floats | float) -
 
 def sweeps(arrays: Arrays, x: Floats, sigma: float, part: float) -> Rounds:
     """Margins after each EXACT Newton step of the primal-dual interior point, from positions (N, d): every one takes two sweeps of the tree.
+    It ends where the barrier is at its floor.
 
     The same equations as `consat.protocols.interior_point`, solved for the whole team at once.
     """
@@ -196,13 +199,15 @@ def sweeps(arrays: Arrays, x: Floats, sigma: float, part: float) -> Rounds:
         psi, slope = arrays.psi(y[:-1, None], arrays.at_positions)
         slack = psi[:, 0] - y[-1]
         a = np.column_stack([slope[..., 0], -np.ones(len(slack))])
-        barrier = max(sigma * (multiplier @ slack) / len(slack), SWEEP_FLOOR * max(1.0, abs(y[-1])))
+        barrier = sigma * (multiplier @ slack) / len(slack)
+        if not barrier > SWEEP_FLOOR * max(1.0, abs(y[-1])):
+            return
         matrix, vector = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
         bowl = (multiplier / slack)[:, None, None] * a[:, :, None] * a[:, None, :] - multiplier[:, None, None] * hessian
         np.add.at(matrix, (rows, columns), bowl)
         np.add.at(vector, at, (barrier / slack)[:, None] * a)
         vector[n] += 1.0
-        matrix = matrix[:-1, :-1] + 1e-14 * np.diag(matrix.diagonal()[:-1])
+        matrix = matrix[:-1, :-1] + SWEEP_INERTIA * np.eye(n + 1) + 1e-14 * np.diag(matrix.diagonal()[:-1])
         step = np.append(np.linalg.solve(matrix, vector[:-1]), 0.0)
         local = step[at]
         along = np.sum(a * local, axis=1)

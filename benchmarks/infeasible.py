@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -31,6 +34,7 @@ from consat.graphs import hops
 from consat.numerics import float64
 from consat.objective import Nu, Schedule
 from consat.scale import automatic, scale
+from consat.simulate.rounds import HOLD
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -99,7 +103,7 @@ class Case:
 
     Attributes:
         shape: ``tree`` or ``line``.
-        team: itself.
+        count: N.
         best: β̄*.
         hops: D.
         smooth: the margin of the formation whose smooth margin is best.
@@ -107,7 +111,7 @@ class Case:
     """
 
     shape: str
-    team: cs.Team
+    count: int
     best: float
     hops: int
     smooth: float = np.nan
@@ -136,14 +140,14 @@ def draw(shape: str, count: int, random: np.random.Generator) -> cs.Team:
     return cs.Team(agents, [(ids[j], ids[i]) for i, j in enumerate(parent, 1)], 2)
 
 
-def case(shape: str, count: int, seed: int) -> tuple[Case, np.ndarray]:
+def case(shape: str, count: int, seed: int) -> tuple[Case, cs.Team, np.ndarray]:
     """The first team drawn from a seed that can't be satisfied, and its best formation, (N, d)."""
     random = np.random.default_rng([seed, count, SHAPES.index(shape)])
     while True:
         team = draw(shape, count, random)
         optimum = max_min(team)
         if optimum.exact and optimum.margin < -PLAINLY:
-            return Case(shape, team, optimum.margin, hops(team.count, team.links)), optimum.positions
+            return Case(shape, count, optimum.margin, hops(count, team.links)), team, optimum.positions
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------------------------
@@ -167,13 +171,15 @@ def follow(rounds: baselines.Rounds, best: float, cap: int) -> Arrived:
             break
         if len(margins) > cap:
             break
+    else:
+        margins += [margins[-1]] * HOLD  # a method that ends by itself stays where it is
     return arrived(np.array(margins), best)
 
 
-def consat(one: Case, protocol: str, rounds: int, seed: int) -> tuple[Arrived, np.ndarray]:
+def consat(team: cs.Team, best: float, protocol: str, rounds: int, seed: int) -> tuple[Arrived, np.ndarray]:
     """One of consat's protocols, and where the agents started, (N, d)."""
-    result = cs.run(one.team, protocol=protocol, rounds=rounds, start=(-BOX, BOX), seed=seed, record=False)
-    found = arrived(np.asarray(result.data["margin"])[:, None], one.best)
+    result = cs.run(team, protocol=protocol, rounds=rounds, start=(-BOX, BOX), seed=seed, record=False)
+    found = arrived(np.asarray(result.data["margin"])[:, None], best)
     floats = result.summary["floats_sent"] / result.summary["messages"]
     return found._replace(floats=floats), np.asarray(result.data["position"])[0]
 
@@ -203,34 +209,38 @@ def smoothed(arrays: Arrays, x: np.ndarray, nu: Nu) -> float:
 
 
 @float64
-def run(say: Report, *, sizes: Sequence[int], seeds: int, cap: int) -> list[Case]:
-    """All methods on all teams."""
-    cases = []
-    for shape, count, seed in itertools.product(SHAPES, sizes, range(seeds)):
-        one, formation = case(shape, count, seed)
-        measure(one, formation, seed, cap)
-        cases.append(one)
-        found = ", ".join(f"{name} {result.exact:.0f}" for name, result in one.results.items())
-        say(f"{shape}, {count} agents, D {one.hops}: {found}")
-    return cases
-
-
-def measure(one: Case, formation: np.ndarray, seed: int, cap: int) -> None:
+def measure(shape: str, count: int, seed: int, cap: int) -> Case:
     """All methods on one team, from the same starts, (N, d); those on the smooth objective also from near its best formation."""
-    arrays, nu = Arrays.of(one.team), Schedule.of(automatic(scale(one.team))).final
+    one, team, formation = case(shape, count, seed)
+    arrays, nu, best = Arrays.of(team), Schedule.of(automatic(scale(team))).final, one.best
     one.smooth = smoothed(arrays, formation, nu)
     near = formation + np.random.default_rng(seed).uniform(-baselines.NEAR, baselines.NEAR, formation.shape)
-    one.results["max-min"], x = consat(one, "max-min", 100 + 8 * one.hops, seed)
-    one.results["admm"], _ = consat(one, "admm", cap, seed)
+    one.results["max-min"], x = consat(team, best, "max-min", 100 + 8 * one.hops, seed)
+    one.results["admm"], _ = consat(team, best, "admm", cap, seed)
     with np.errstate(all="ignore"):  # lanes that overflow are lost, and others go on
-        one.results["sweeps"] = sweeps(arrays, x, one.best, one.hops)
+        one.results["sweeps"] = sweeps(arrays, x, best, one.hops)
         for name, rounds in (
             ("dual", baselines.dual(arrays, x)),
             ("subgradient", baselines.subgradient(arrays, x)),
-            ("extra", baselines.smooth("extra", arrays, (x, near), nu, one.best)),
-            ("flow", baselines.smooth("flow", arrays, (x, near), nu, one.best)),
+            ("extra", baselines.smooth("extra", arrays, (x, near), nu, best)),
+            ("flow", baselines.smooth("flow", arrays, (x, near), nu, best)),
         ):
-            one.results[name] = follow(rounds, one.best, cap)
+            one.results[name] = follow(rounds, best, cap)
+    return one
+
+
+def run(say: Report, *, sizes: Sequence[int], seeds: int, cap: int) -> list[Case]:
+    """All teams, one process a core."""
+    cases = []
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes to come
+    teams = itertools.product(range(seeds), sizes, SHAPES)
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(measure, shape, count, seed, cap) for seed, count, shape in teams]):
+            one = done.result()
+            cases.append(one)
+            found = ", ".join(f"{name} {result.exact:.0f}" for name, result in one.results.items())
+            say(f"{one.shape}, {one.count} agents, D {one.hops}: {found}")
+    return sorted(cases, key=lambda one: (SHAPES.index(one.shape), one.count, one.hops, one.best))
 
 
 # --- the report -------------------------------------------------------------------------------------------------------------------------
@@ -243,8 +253,8 @@ def median(values: Sequence[float]) -> float:
 
 def groups(cases: Sequence[Case]) -> list[tuple[str, int, list[Case]]]:
     """The cases by shape and size."""
-    keys = dict.fromkeys((one.shape, one.team.count) for one in cases)
-    return [(*key, [one for one in cases if (one.shape, one.team.count) == key]) for key in keys]
+    keys = dict.fromkeys((one.shape, one.count) for one in cases)
+    return [(*key, [one for one in cases if (one.shape, one.count) == key]) for key in keys]
 
 
 def _rounds(cases: Sequence[Case], tolerance: str) -> str:
@@ -352,7 +362,7 @@ Every method but consat's runs at its best parameters, chosen for every team and
 
 
 def report(cases: Sequence[Case], machine: str, seeds: int, cap: int) -> str:
-    sizes = sorted({one.team.count for one in cases})
+    sizes = sorted({one.count for one in cases})
     sigmas, parts = (", ".join(f"{value:g}" for value in dict.fromkeys(column)) for column in zip(*baselines.SWEEP_GAINS, strict=True))
     steps = [one.results["sweeps"].steps for one in cases]
     floats, floats_admm = (f"{np.median([one.results[name].floats for one in cases]):.0f}" for name in ("max-min", "admm"))
