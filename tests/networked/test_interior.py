@@ -385,13 +385,17 @@ def test_mail_keeps_its_places_when_somebody_has_gone() -> None:
     assert letter.numbers().sound(said.pair[0])  # type: ignore[misc]
 
 
-def test_a_part_tells_what_travels_and_along_which_links() -> None:
-    """In a ring whose copies travel along a tree, one link carries nothing, so its ends are no neighbours; the level crosses all others."""
+@pytest.mark.parametrize("protocol", ["interior-point", "max-min"])
+def test_a_part_tells_what_travels_and_along_which_links(protocol: str) -> None:
+    """Of a ring max-min uses a tree, whose missing link makes its ends no neighbours. In both the level crosses all links but one."""
     agents = "\n".join(f"  - {{id: a{i}, constraints: [{{kind: near, agent: a{i % 4 + 1}, radius: 1}}]}}" for i in (1, 2, 3, 4))
-    made = split(loads(f"consat: 1\nagents:\n{agents}\ncommunication: {{graph: ring}}\n"))
+    text = f"consat: 1\nagents:\n{agents}\ncommunication: {{graph: ring}}\nprotocol: {{kind: {protocol}}}\n"
+    made = split(loads(text))
     pairs = {(agent, neighbour.id): neighbour for agent, part in made.items() for neighbour in part.neighbours}
-    assert len(pairs) == 6
-    assert all(neighbour.level for neighbour in pairs.values())
+    tree = protocol == "max-min"
+    assert len(pairs) == (6 if tree else 8)
+    assert sum(neighbour.level for neighbour in pairs.values()) == 6
     for (agent, other), neighbour in pairs.items():
-        assert pairs[other, agent].travels == neighbour.travels
-    assert {part.hops for part in made.values()} == {3}
+        back = pairs[other, agent]
+        assert (back.travels, back.level) == (neighbour.travels, neighbour.level)
+    assert {(part.hops, part.exact) for part in made.values()} == {(3, True) if tree else (2, False)}

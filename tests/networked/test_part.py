@@ -97,7 +97,7 @@ def part_text() -> str:
     [
         ("hops: 2", "hops: -2", "hops: it is -2, but must be greater than or equal to 0"),
         ("consat-part: 2", "consat-part: 1", "the version is 1, but this consat reads 2; split the scenario again"),
-        ("psi: 0.4", "psi: -0.4", "psi: it is -0.48999999999999994, but must be greater than 0"),
+        ("psi: 1", "psi: -1", "psi: it is -1, but must be greater than 0"),
         ("travels: [a1]", "travels: [a3]", "it must name agents of shares, each once, in their order"),
         ("agent: a2\n", "agent: a9\n", "agent 'a9' is not among the agents of the scenario within"),
         ("length: 1", "length: .nan", "length: it is nan, but must be a finite number"),
