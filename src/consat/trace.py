@@ -36,7 +36,7 @@ class Trace:
         messages: sent in all; None in continuous time.
         floats_sent: likewise.
         known: what every agent knows at the end: that all are ``satisfied``, that the team is ``infeasible``, or nothing.
-        known_from: the round since when; None in continuous time, or if they know nothing.
+        known_from: the round since when, or the time, s, where agents take turns in time; None in continuous time, or if they know nothing.
         seconds: spent on ``compile`` and ``run``.
         period: of a round, s; None in continuous time, and where rounds take no time.
         recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
@@ -63,7 +63,7 @@ class Trace:
     messages: int | None
     floats_sent: int | None
     known: Literal["satisfied", "infeasible"] | None
-    known_from: int | None
+    known_from: float | None
     seconds: Mapping[str, float]
     period: float | None = None
     recorded: np.ndarray | None = None

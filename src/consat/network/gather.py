@@ -149,12 +149,11 @@ class Observer:
             agents[agent] = {
                 "sent": dict(seen.sent), "dropped": report.get("dropped", {}), "cpu": None if seen.ended is None else seen.ended.get("cpu"),
             }  # fmt: skip
-        _, known = self.all_known()
         trips = [link["trip"] for link in links if link["trip"] is not None]
         return {
             "loss": float(np.mean([link["loss"] for link in links])) if links else None,
             "round_trip": float(np.median(trips)) if trips else None,
-            "known_from": None if known is None else known - (self._begin() if self.clock == "time" else 0.0),
+            "known_from": self._known_from(),
             "agents": agents,
         }
 
@@ -171,7 +170,6 @@ class Observer:
         dt = 1.0 if self.clock == "round" else SAMPLE
         margins, smooth = map(np.asarray, _look(Objective.at_positions(self.team), jnp.asarray(position), nu))
         sent = sum((seen.sent for seen in self.seen.values()), Counter[str]())
-        known, known_from = self.all_known()
         return Trace(
             clock="round" if self.clock == "round" else "time",
             steps=steps if self.clock == "time" else steps.astype(int),
@@ -189,11 +187,18 @@ class Observer:
             satisfied_from=satisfied_from(steps, margins.min(axis=1), interpolate=False),
             messages=sent["messages"],
             floats_sent=sent["floats"],
-            known=known,
-            known_from=int(known_from) if known_from is not None and self.clock == "round" else None,
+            known=self.all_known()[0],
+            known_from=self._known_from(),
             seconds=seconds,
             violated=shares_of(self.team, position),
         )
+
+    def _known_from(self) -> float | None:
+        """Since which round all know it, or since how many s after the first stamp."""
+        since = self.all_known()[1]
+        if since is None:
+            return None
+        return int(since) if self.clock == "round" else since - self._begin()
 
     def _begin(self) -> float:
         """The first stamp."""
