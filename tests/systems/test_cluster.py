@@ -54,8 +54,8 @@ def check_same(several: dict[str, Any], one: dict[str, Any]) -> None:
     [
         (
             2,
-            ["--loss", "0.2", "--sleep", "0.1", "--rate", "10", "--speed", "2", "--rounds", "70"],
-            {"loss": 0.2, "sleep": 0.1, "rate": 10, "speed": 2, "rounds": 70},
+            ["--loss", "0.2", "--sleep", "0.1", "--rate", "10", "--speed", "2", "--rounds", "70", "--protocol", "admm"],
+            {"loss": 0.2, "sleep": 0.1, "rate": 10, "speed": 2, "rounds": 70, "protocol": "admm"},
         ),
         (4, ["--rounds", "33", "--protocol", "proximal"], {"rounds": 33, "protocol": "proximal"}),
     ],

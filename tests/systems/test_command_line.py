@@ -44,7 +44,7 @@ def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, t
         (["sweep", "case-c", "--over", "loss=0:inf:3"], "consat: '0:inf:3' is no range; FROM and TO must be finite"),
         (["sweep", "case-c", "--over", "loss=0", "--over", "loss=0.1"], "Error: --over loss is given twice; write all its values in one"),
         (
-            ["launch", "case-c", "--protocol", "max-min"],
+            ["launch", "case-c", "--mode", "admm", "--protocol", "max-min"],
             "consat: mode admm runs the protocol admm, but the protocol is max-min; mode lockstep",
         ),
         (
@@ -53,9 +53,9 @@ def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, t
         ),
         (
             ["launch", "case-c", "--mode", "lockstep", "--protocol", "gradient-flow"],
-            "consat: mode lockstep runs protocols in rounds, admm, proximal, max-min, but",
+            "consat: mode lockstep runs protocols in rounds, interior-point, max-min, admm, proximal, but",
         ),
-        (["launch", "case-c", "--pace", "2"], "consat: mode admm has no time of its own; only link takes a pace"),
+        (["launch", "case-c", "--pace", "2"], "consat: mode interior-point has no time of its own; only link takes a pace"),
         (
             ["init", "case-z"],
             "Error: there is no packaged scenario 'case-z'; did you mean 'case-e'? For an empty scenario of that name: consat ",

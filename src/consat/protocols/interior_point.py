@@ -76,7 +76,7 @@ class InteriorPoint:
     boundary: float = 0.7
     floor: float = 1e-4
     couple: float = 3.0
-    apart: float = 0.1
+    apart: float = 0.3
     drop: float = 3.0
     warm: int = 1
     far: float = 0.0

@@ -70,14 +70,15 @@ def why_admm(team: Team, layout: Layout) -> str | None:
 
 
 def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settings:
-    """What the scenario asks for, and `given` overrides; the default protocol is that of the team.
+    """What the scenario asks for, and `given` overrides; the default protocol is that whose gains are given, or that of the team.
 
     Raises:
         InvalidSettings: there is no such protocol.
     """
     start, seed = given["start"], given["seed"]
     estimates = given["estimates"] or asked.protocol.estimates
-    kind = given["protocol"] or asked.protocol.kind or default_protocol(team, estimates)
+    tuned = "admm" if asked.protocol.penalty is not None or asked.protocol.relaxation is not None else None
+    kind = given["protocol"] or asked.protocol.kind or tuned or default_protocol(team, estimates)
     settings = asked.model_copy(
         update={
             "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
