@@ -46,10 +46,11 @@ def test_runs_of_a_batch_are_those_that_they_are_by_themselves() -> None:
     ids=["gain", "start", "smoothing"],
 )
 def test_parameters_of_every_kind(path: str, options: list[Any]) -> None:
-    found = cs.sweep("case-b", {path: options}, seeds=[7, 3])
+    found = cs.sweep("case-b", {path: options}, seeds=[7, 3], protocol="admm")
     assert [row["seed"] for row in found.runs] == [7, 3, 7, 3]
     for row in found.runs:
-        check_against_single(row, cs.run(cs.load("case-b", [f"{path}={json.dumps(row[path])}"]), seed=row["seed"]).summary)
+        scenario = cs.load("case-b", [f"{path}={json.dumps(row[path])}"])
+        check_against_single(row, cs.run(scenario, seed=row["seed"], protocol="admm").summary)
     assert found.runs[0]["margin"] != found.runs[2]["margin"]
 
 
