@@ -31,11 +31,11 @@ def check_against_single(row: dict[str, Any], single: dict[str, Any]) -> None:
 
 def test_runs_of_a_batch_are_those_that_they_are_by_themselves() -> None:
     over = {"loss": [0.0, 0.3], "agents.a2.constraints.0.radius": [1.2, 1.7, 3.0]}
-    found = cs.sweep("case-c", over, seeds=4, sleep=0.1)
+    found = cs.sweep("case-c", over, seeds=4, sleep=0.1, protocol="admm")
     assert len(found.runs) == 24
     for row in found.runs:
         scenario = cs.load("case-c", [f"agents.a2.constraints.0.radius={row['agents.a2.constraints.0.radius']}"])
-        check_against_single(row, cs.run(scenario, seed=row["seed"], loss=row["loss"], sleep=0.1).summary)
+        check_against_single(row, cs.run(scenario, seed=row["seed"], loss=row["loss"], sleep=0.1, protocol="admm").summary)
     # some of each kind: a reach of 1.2 is infeasible, and admm ends at the best smooth margin, which is not the best margin
     assert {row["status"] for row in found.runs} == {"satisfied", "not-converged"}
 
@@ -99,7 +99,7 @@ def test_values_are_lists_or_ranges() -> None:
 def test_wrong_input_is_told() -> None:
     with pytest.raises(InvalidScenario, match="no entry 'a9'"):
         cs.sweep("case-c", {"agents.a9.start": [1]})
-    with pytest.raises(InvalidSettings, match="probabilities"):
+    with pytest.raises(InvalidSettings, match="a probability below 1"):
         cs.sweep("case-c", {"loss": [1.5]})
     with pytest.raises(InvalidSettings, match="no values"):
         cs.sweep("case-c", {"loss": []})
