@@ -9,6 +9,8 @@ import pytest
 import consat as cs
 
 PILLAR = 1.5
+# the protocol whose agents walk straight at their goals
+DRIVEN: dict[str, Any] = {"protocol": "admm", "rate": 10, "speed": 0.5}
 
 
 def corridor() -> cs.Team:
@@ -32,7 +34,7 @@ def within_the_pillar(result: cs.Result, agent: str) -> float:
 
 @pytest.fixture(scope="module")
 def crossing() -> cs.Result:
-    return cs.run(corridor(), rate=10, speed=0.5)
+    return cs.run(corridor(), **DRIVEN)
 
 
 def test_a_path_through_a_pillar_is_said(crossing: cs.Result) -> None:
@@ -54,14 +56,14 @@ def test_a_path_through_a_pillar_is_said(crossing: cs.Result) -> None:
 
 
 def test_nothing_is_lost_where_little_is_recorded(crossing: cs.Result, tmp_path: Path) -> None:
-    thin = cs.run(corridor(), rate=10, speed=0.5, every=50, agents=["buddy"], out=tmp_path / "filed")
+    thin = cs.run(corridor(), **DRIVEN, every=50, agents=["buddy"], out=tmp_path / "filed")
     assert told(thin) == told(crossing)
     assert told(cs.Result.load(tmp_path / "filed" / "result.nc")) == told(crossing)
 
 
 def test_a_run_that_is_taken_up_goes_on_counting(tmp_path: Path) -> None:
-    whole = cs.run(corridor(), rate=10, speed=0.5, rounds=120)
-    cs.run(corridor(), rate=10, speed=0.5, rounds=90, out=tmp_path, checkpoint=0.0)
+    whole = cs.run(corridor(), **DRIVEN, rounds=120)
+    cs.run(corridor(), **DRIVEN, rounds=90, out=tmp_path, checkpoint=0.0)
     assert told(cs.resume(tmp_path, rounds=120)) == told(whole)
     assert 0 < told(whole)[("robot", "pillar")] < 1  # type: ignore[operator]
 
