@@ -18,9 +18,9 @@ import peers
 from scipy.sparse import coo_array, csr_array
 
 import consat as cs
-from consat.central.quadratics import expand
-from consat.estimates import Estimates
-from consat.objective import STEEPEST, Nu
+from consat.certify.quadratics import expand
+from consat.problem.objective import STEEPEST, Nu
+from consat.protocols.estimates import Estimates
 
 Floats = np.ndarray
 Rounds = Iterator[Floats]

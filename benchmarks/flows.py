@@ -25,12 +25,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import consat as cs
-from consat.estimates import Estimates
+from consat.engine.flows import CHUNK, Observer, Problem, _advance
+from consat.engine.recording import Choice
 from consat.numerics import float64
-from consat.objective import Schedule
+from consat.problem.objective import Schedule
 from consat.protocols import GradientFlow
-from consat.simulate.flows import CHUNK, Observer, Problem, _advance
-from consat.simulate.recording import Choice
+from consat.protocols.estimates import Estimates
 from tests import paper
 
 UNTIL = 300.0

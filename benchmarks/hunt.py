@@ -37,7 +37,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import consat as cs
-from consat.central import assumptions
+from consat.certify import assumptions
 from consat.numerics import float64
 
 PROTOCOLS = ("interior-point", "admm", "gradient-flow")

@@ -29,12 +29,12 @@ from rounds import for_good, machine, table
 from scipy.optimize import minimize
 
 import consat as cs
-from consat.central.reference import max_min
-from consat.graphs import hops
+from consat.certify.optimum import max_min
+from consat.engine.rounds import HOLD
 from consat.numerics import float64
-from consat.objective import Nu, Schedule
-from consat.scale import automatic, scale
-from consat.simulate.rounds import HOLD
+from consat.problem.graphs import hops
+from consat.problem.objective import Nu, Schedule
+from consat.problem.units import automatic, scale
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from consat.network.fleet import Event, Fleet, free_ports
-from consat.network.part import split
+from consat.network.deploy.fleet import Event, Fleet, free_ports
+from consat.network.node.part import split
 from consat.scenario import Scenario, load, loads
 
 START = 300.0

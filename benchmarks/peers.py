@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.engine.round import Everyone
 from consat.numerics import quick_compilation
-from consat.objective import Nu
-from consat.simulate.kernel import Everyone
+from consat.problem.objective import Nu
 
 RAMP = (0.002, 0.0044)
 """Start, and rise in a second, of the paper's ramp of ν_β, as fractions of its end (0.01 and 0.022 of 5)."""

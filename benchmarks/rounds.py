@@ -30,17 +30,17 @@ from families import FAMILIES, Problem
 from jax import Array
 from scipy.optimize import minimize
 
-from consat.central.certificate import bounds
-from consat.central.quadratics import values_and_gradients
-from consat.central.reference import cluster_margins, max_min
-from consat.estimates import Estimates
+from consat.certify.certificate import bounds
+from consat.certify.optimum import cluster_margins, max_min
+from consat.certify.quadratics import values_and_gradients
+from consat.engine.round import Weather, World, begin, many_rounds, world_of
+from consat.engine.rounds import HOLD
 from consat.numerics import Groups, float64, quick_compilation
-from consat.objective import Nu, Objective, Schedule
+from consat.problem.objective import Nu, Objective, Schedule
+from consat.problem.units import Scale, automatic, scale
 from consat.protocols import PAIRED, ROUNDS, Rounds
+from consat.protocols.estimates import Estimates
 from consat.runs.preparation import way_of
-from consat.scale import Scale, automatic, scale
-from consat.simulate.kernel import Weather, World, begin, many_rounds, world_of
-from consat.simulate.rounds import HOLD
 
 CLOSE = 1e-3
 """Of the scale of ψ: how near the optimum counts as there."""

@@ -31,16 +31,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import consat as cs
-from consat.central.quadratics import shape_of
-from consat.estimates import Estimates
+from consat.certify.quadratics import shape_of
+from consat.engine import round as kernel
+from consat.engine.chunks import CHUNK
+from consat.engine.flows import Problem, rate
 from consat.numerics import float64, thorough_compilation
-from consat.objective import Nu, Schedule
+from consat.problem.objective import Nu, Schedule
+from consat.problem.units import automatic, scale
 from consat.protocols import FLOWS, ROUNDS, State
+from consat.protocols.estimates import Estimates
 from consat.runs.preparation import first_estimates
-from consat.scale import automatic, scale
-from consat.simulate import kernel
-from consat.simulate.engine import CHUNK
-from consat.simulate.flows import Problem, rate
 
 TEAMS = ("convoy", "lattice", "swarm")
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)

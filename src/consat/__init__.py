@@ -12,32 +12,32 @@ from consat import forks
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from consat.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
-    from consat.objective import margins
-    from consat.result import Result
+    from consat.problem.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
+    from consat.problem.groups import Group, each
+    from consat.problem.objective import margins
+    from consat.problem.team import Agent, Team
+    from consat.results.result import Result
     from consat.runs.runner import resume, run
     from consat.runs.solving import solve
     from consat.runs.sweeping import Sweep, sweep
     from consat.scenario import Scenario, dump, load, loads
     from consat.settings import Ramp, Settings, Smoothing
-    from consat.teams.groups import Group, each
-    from consat.teams.team import Agent, Team
 
 _HOME = {
-    "constraints": ("Constraint", "apart", "box", "constraint", "displacement", "expr", "halfspace", "near", "outside", "within"),
+    "problem.constraints": ("Constraint", "apart", "box", "constraint", "displacement", "expr", "halfspace", "near", "outside", "within"),
     "errors": (
         "ConsatError", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario", "InvalidSettings", "InvalidTeam",
     ),
-    "objective": ("margins",),
-    "result": ("Result",),
+    "problem.objective": ("margins",),
+    "results.result": ("Result",),
     "runs.runner": ("resume", "run"),
     "runs.solving": ("solve",),
     "runs.sweeping": ("Sweep", "sweep"),
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
-    "teams.groups": ("Group", "each"),
-    "teams.team": ("Agent", "Team"),
+    "problem.groups": ("Group", "each"),
+    "problem.team": ("Agent", "Team"),
 }  # fmt: skip
 forks.watch()
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

@@ -1,4 +1,4 @@
-"""One tree of errors. They are for wrong input only: divergence, time-out and infeasibility are outcomes, see `consat.result`."""
+"""One tree of errors. They are for wrong input only: divergence, time-out and infeasibility are outcomes, see `consat.results.result`."""
 
 from __future__ import annotations
 

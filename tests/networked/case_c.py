@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from consat.network.modes import Manner
-from consat.network.part import Part, split
-from consat.network.rehearsal import Rehearsal
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node.modes import Manner
+from consat.network.node.part import Part, split
 from consat.network.transports.memory import Air, Conditions
 from consat.scenario import load
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consat.network.pairs import INDEFINITE, Letter
+from consat.network.node.pairs import INDEFINITE, Letter
 from consat.network.wire import Checker, Kind, Message, Numbers, Reason, encode
 
 PROBLEM = bytes(range(8))

@@ -1,4 +1,5 @@
-"""Run as a program, with every product rounded by itself (see `consat.network.environment`): lockstep against `simulate`, to the last bit.
+"""Run as a program, with every product rounded by itself (see `consat.network.deploy.environment`): lockstep against the engine, to the
+last bit.
 
 Prints JSON: the trajectory that `simulate` gives of case C, and for each trial over the network in memory by how much the agents' differ
 from what it gives; without trials if an argument says ``truth``.
@@ -12,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 import consat as cs
-from consat.network.modes import Manner
-from consat.network.part import split
-from consat.network.rehearsal import Rehearsal
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node.modes import Manner
+from consat.network.node.part import split
 from consat.network.transports.memory import Air, Conditions
 from consat.scenario import load
 

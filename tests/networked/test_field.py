@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.network import process
-from consat.network.helm import PERIOD, VALID
-from consat.network.modes import Manner
-from consat.network.part import split
-from consat.network.process import Circumstances, run_agent
-from consat.network.rehearsal import Rehearsal
-from consat.network.station import Station
+from consat.network.deploy import process
+from consat.network.deploy.process import Circumstances, run_agent
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node.helm import PERIOD, VALID
+from consat.network.node.modes import Manner
+from consat.network.node.part import split
+from consat.network.node.station import Station
 from consat.network.transports.memory import Air, Conditions
 from consat.numerics import float64
-from consat.objective import Objective
+from consat.problem.objective import Objective
 from consat.scenario import load, loads
 from tests.networked.case_c import events, parts, rehearse
 

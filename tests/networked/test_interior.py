@@ -9,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 
-from consat.network import guard, pair_core
-from consat.network.core import Embodied, Moment
-from consat.network.modes import Manner, core_of
-from consat.network.pairs import HEAD, Letter, Packing
-from consat.network.part import split
-from consat.network.rehearsal import Rehearsal
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node import guard, pair_core
+from consat.network.node.core import Embodied, Moment
+from consat.network.node.modes import Manner, core_of
+from consat.network.node.pairs import HEAD, Letter, Packing
+from consat.network.node.part import split
 from consat.network.transports.memory import Air, Conditions
 from consat.network.wire import Message, encode
 from consat.numerics import float64

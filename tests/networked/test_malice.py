@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from consat.network import guard
-from consat.network.core import Moment, RoundCore, Rows
-from consat.network.lockstep import Lockstep
-from consat.network.membership import MOST, Membership
-from consat.network.modes import Manner, core_of
-from consat.network.rehearsal import Rehearsal
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node import guard
+from consat.network.node.core import Moment, RoundCore, Rows
+from consat.network.node.lockstep import Lockstep
+from consat.network.node.membership import MOST, Membership
+from consat.network.node.modes import Manner, core_of
 from consat.network.wire import AHEAD, Kind, Message, encode
 from consat.numerics import float64
 from tests.networked.case_c import GOAL, parts, rehearse

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from consat.cli import cli
+from consat.cli.main import cli
 from consat.errors import InvalidScenario, InvalidSettings, InvalidTeam
-from consat.network.alone import Alone, ends
-from consat.network.part import Part, read_part, split, write_part
+from consat.network.node.part import Part, read_part, split, write_part
+from consat.network.node.problem import Alone, ends
 from consat.numerics import float64
+from consat.problem.team import Agent, Team
 from consat.scenario import Scenario, load, loads
 from consat.scenario.files import Settings
-from consat.teams.team import Agent, Team
 from tests.networked.case_c import parts
 
 SPLIT = """

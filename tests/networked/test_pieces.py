@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from consat.errors import InvalidSettings, NetworkError
-from consat.network.board import table
-from consat.network.body import CONFIRMED, MeasuredBody, Measurement, SimulatedBody
-from consat.network.environment import prepare
-from consat.network.gather import Observer
-from consat.network.membership import Membership
-from consat.network.modes import Manner, core_of
-from consat.network.persistence import Store
+from consat.network.deploy.dashboard import table
+from consat.network.deploy.environment import prepare
+from consat.network.deploy.observer import Observer
+from consat.network.node.body import CONFIRMED, MeasuredBody, Measurement, SimulatedBody
+from consat.network.node.membership import Membership
+from consat.network.node.modes import Manner, core_of
+from consat.network.node.persistence import Store
+from consat.network.transports.faults import Weathered
 from consat.network.transports.memory import Air, Conditions
-from consat.network.transports.weather import Weathered
 from consat.scenario import load
 from tests.networked.case_c import parts
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.network.core import Embodied, Kept, Moment, Rows, Turned
-from consat.network.link_core import LinkCore, LinkState
-from consat.network.modes import Manner, Runner
-from consat.network.paced import Paced
-from consat.network.part import split
-from consat.network.rehearsal import Rehearsal
-from consat.network.station import Station
+from consat.network.deploy.rehearsal import Rehearsal
+from consat.network.node.core import Embodied, Kept, Moment, Rows, Turned
+from consat.network.node.link_core import LinkCore, LinkState
+from consat.network.node.modes import Manner, Runner
+from consat.network.node.paced import Paced
+from consat.network.node.part import split
+from consat.network.node.station import Station
 from consat.network.transports.memory import Air, Conditions
 from consat.numerics import float64
 from consat.scenario import loads
@@ -236,7 +236,7 @@ def _load(name: str) -> Any:
 
 @float64
 def margin(name: str, positions: np.ndarray) -> float:
-    from consat.objective import Objective
+    from consat.problem.objective import Objective
 
     return float(Objective.at_positions(_load(name).team).agent_margins(jnp.asarray(positions)).min())
 

@@ -24,9 +24,10 @@ from cryptography import x509
 from hypothesis import given
 from hypothesis import strategies as st
 
+from consat.cli import network as commands
+from consat.cli.keys import keys as keys_command
 from consat.errors import NetworkError
-from consat.network import commands, keys
-from consat.network.keys_command import keys as keys_command
+from consat.network import keys
 from consat.network.names import spelled
 from consat.network.transports import zenoh as transport
 from consat.network.transports.zenoh import _key, _protection, _settings, _token, connect

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.estimates import Estimates
+from consat.engine.round import Body, Seen, Weather, World, begin, many_rounds, world_of
 from consat.numerics import float64, quick_compilation
-from consat.objective import Schedule
+from consat.problem.objective import Schedule
+from consat.problem.team import Team
+from consat.problem.units import automatic, scale
 from consat.protocols import Admm, agreement
+from consat.protocols.estimates import Estimates
 from consat.runs.preparation import first_estimates
-from consat.scale import automatic, scale
-from consat.simulate.kernel import Body, Seen, Weather, World, begin, many_rounds, world_of
-from consat.teams.team import Team
 
 SPEED = 0.5
 

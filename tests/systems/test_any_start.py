@@ -10,7 +10,7 @@ import pytest
 
 import consat as cs
 from consat.numerics import float64
-from consat.scale import Region, scale
+from consat.problem.units import Region, scale
 from tests.unit import teams
 
 FAR = (-1e4, 1e4)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import consat as cs
+from consat.engine.partition import Share, assign
 from consat.errors import InvalidSettings
-from consat.estimates import Estimates
 from consat.processes import asked
-from consat.simulate.partition import Share, assign
+from consat.protocols.estimates import Estimates
 
 CONSAT = Path(sysconfig.get_path("scripts")) / "consat"
 PATIENCE = 400

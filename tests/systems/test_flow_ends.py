@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.simulate import flows
+from consat.engine import flows
 
 SMOOTHING = cs.Smoothing(nu_alpha=5, nu_beta=5)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.central.reference import max_min
+from consat.certify.optimum import max_min
 from tests.unit import teams
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import consat as cs
+from consat.engine import recording
 from consat.errors import InvalidResult, InvalidSettings
-from consat.simulate import recording
 
 CONSAT = Path(sysconfig.get_path("scripts")) / "consat"
 

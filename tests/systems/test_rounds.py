@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.central.reference import max_min
-from consat.estimates import Estimates
+from consat.certify.optimum import max_min
+from consat.engine.round import Weather, world_of
+from consat.engine.rounds import simulate_rounds
 from consat.numerics import float64
-from consat.objective import Nu
+from consat.problem.objective import Nu
+from consat.problem.units import scale
 from consat.protocols import Admm, Proximal
-from consat.scale import scale
-from consat.simulate.kernel import Weather, world_of
-from consat.simulate.rounds import simulate_rounds
+from consat.protocols.estimates import Estimates
 from tests.unit import teams
 
 SEEDS = range(10)

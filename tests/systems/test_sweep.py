@@ -78,7 +78,7 @@ def test_mean_and_spread_are_those_of_the_runs() -> None:
 
 
 def test_more_runs_than_places_in_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("consat.simulate.batch.LANES", 4)
+    monkeypatch.setattr("consat.engine.batch.LANES", 4)
     few = cs.sweep("case-c", seeds=11, loss=0.3)
     monkeypatch.undo()
     many = cs.sweep("case-c", seeds=11, loss=0.3)

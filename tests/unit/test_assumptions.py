@@ -6,9 +6,9 @@ import pytest
 from scipy.optimize import linprog
 
 import consat as cs
-from consat.central.assumptions import binding_auxiliaries, existence, report, with_auxiliary
-from consat.central.quadratics import expand
-from consat.central.reference import max_min
+from consat.certify.assumptions import binding_auxiliaries, existence, report, with_auxiliary
+from consat.certify.optimum import max_min
+from consat.certify.quadratics import expand
 from tests.unit.teams import case
 
 A = cs.Agent

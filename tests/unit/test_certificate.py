@@ -4,13 +4,13 @@ import pytest
 from scipy.optimize import minimize
 
 import consat as cs
-from consat.central.certificate import bounds
-from consat.central.levels import radii
-from consat.central.quadratics import expand, values_and_gradients
-from consat.central.reference import cluster_margins, max_min
-from consat.graphs import clusters
+from consat.certify.certificate import bounds
+from consat.certify.levels import radii
+from consat.certify.optimum import cluster_margins, max_min
+from consat.certify.quadratics import expand, values_and_gradients
 from consat.numerics import float64
-from consat.objective import Nu, Objective, margin_bounds
+from consat.problem.graphs import clusters
+from consat.problem.objective import Nu, Objective, margin_bounds
 from tests.unit.teams import MARGINS, case, grid, many
 
 TABLE = {

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
-from consat.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
-from consat.constraints.functions import safe_norm
-from consat.constraints.node import Node
+from consat.problem.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
+from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
+from consat.problem.constraints.functions import safe_norm
+from consat.problem.constraints.node import Node
 
 STRICTLY, CONCAVE, UNKNOWN, NOT = Curvature
 PARAMETERS = {"a": 2.0, "b": -0.5, "c": np.array([1.0, -2.0])}

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.constraints.domain import Extended, extended
-from consat.constraints.library import KINDS
 from consat.numerics import float64
-from consat.objective import Nu, Objective
+from consat.problem.constraints.domain import Extended, extended
+from consat.problem.constraints.library import KINDS
+from consat.problem.objective import Nu, Objective
 
 A = cs.Agent
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from consat.constraints.expression import MAX_DEPTH, MAX_EXPONENT, MAX_LENGTH, MAX_NODES, MAX_NUMBER, Expression
 from consat.errors import InvalidExpression
+from consat.problem.constraints.expression import MAX_DEPTH, MAX_EXPONENT, MAX_LENGTH, MAX_NODES, MAX_NUMBER, Expression
 
 # Inside the domain of every function below, and no entry equal to another.
 POSITIONS = {

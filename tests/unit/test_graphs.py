@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat import graphs
-from consat.central.assumptions import report
-from consat.estimates import Estimates, Layout
-from consat.network.part import split
+from consat.certify.assumptions import report
+from consat.network.node.part import split
 from consat.numerics import float64
+from consat.problem import graphs
+from consat.protocols.estimates import Estimates, Layout
 from consat.views import tables
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.teams.groups import layout
+from consat.problem.groups import layout
 
 
 def said(team: cs.Team) -> set[tuple[Any, ...]]:

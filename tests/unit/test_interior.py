@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.central.reference import max_min as reference
-from consat.graphs import clusters
-from consat.interior import Interior, route_of
-from consat.interior.algebra import LOOPED, gram, reduced, solve, spread
+from consat.certify.optimum import max_min as reference
 from consat.numerics import float64
-from consat.objective import Objective
+from consat.problem.graphs import clusters
+from consat.problem.objective import Objective
+from consat.problem.units import scale
 from consat.protocols.interior_point import InteriorPoint
-from consat.scale import scale
+from consat.protocols.local.interior import Interior, route_of
+from consat.protocols.local.interior.algebra import LOOPED, gram, reduced, solve, spread
 from tests.unit.teams import MARGINS, case
 
 
@@ -213,7 +213,7 @@ def test_loops_narrow_enough_are_cut_open_and_wide_ones_proven_by_nobody(monkeyp
     assert route == "tree"
     assert route_of(team, "local", exact=False).route == "links"
     assert Interior.of(team, copies, scale(team)).plan.exact
-    monkeypatch.setattr("consat.interior.layout.WIDE", 3)
+    monkeypatch.setattr("consat.protocols.local.interior.layout.WIDE", 3)
     route, copies, why = route_of(team, "local")
     assert route == "links"
     assert "more than 3" in why

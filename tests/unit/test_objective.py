@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.estimates import Estimates
+from consat.engine.flows import Everyone, Problem
 from consat.numerics import Groups, float64
-from consat.objective import Nu, Objective, Schedule, margin_bounds
+from consat.problem.objective import Nu, Objective, Schedule, margin_bounds
 from consat.protocols import GradientFlow
+from consat.protocols.estimates import Estimates
 from consat.settings import Ramp, Smoothing
-from consat.simulate.flows import Everyone, Problem
 from tests import paper
 
 NU = Nu(5.0, 3.0)

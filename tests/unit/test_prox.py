@@ -11,12 +11,12 @@ import pytest
 from scipy.optimize import brentq, minimize
 
 import consat as cs
-from consat import prox
-from consat.estimates import Estimates
 from consat.numerics import float64
-from consat.objective import Nu
-from consat.prox import newton
-from consat.prox.lanes import Lanes
+from consat.problem.objective import Nu
+from consat.protocols.estimates import Estimates
+from consat.protocols.local import proximal as prox
+from consat.protocols.local.proximal import newton
+from consat.protocols.local.proximal.lanes import Lanes
 
 BOXES = (4.0, 1e2, 1e4, 1e6)
 SMOOTHINGS = (0.05, 5.0, 1e3)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat import prox
-from consat.estimates import Estimates
 from consat.numerics import float64
-from consat.objective import Nu
-from consat.prox import batches
-from consat.prox.hessians import LOOPED, UNROLLED, Alike, Dense, solve_symmetric
-from consat.prox.lanes import variance
+from consat.problem.objective import Nu
+from consat.protocols.estimates import Estimates
+from consat.protocols.local import proximal as prox
+from consat.protocols.local.proximal import batches
+from consat.protocols.local.proximal.hessians import LOOPED, UNROLLED, Alike, Dense, solve_symmetric
+from consat.protocols.local.proximal.lanes import variance
 
 EXACT = prox.Precision(1e-10)
 ONE_STEP = prox.Precision(None)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.central.reasons import explain, restricted
-from consat.central.reference import max_min
+from consat.certify.optimum import max_min
+from consat.certify.reasons import explain, restricted
 from tests.unit.teams import case
 
 A = cs.Agent

@@ -4,9 +4,9 @@ import pytest
 from scipy.optimize import minimize
 
 import consat as cs
-from consat.central.quadratics import expand, values_and_gradients
-from consat.central.reference import cluster_margins, concave_part, max_min
-from consat.graphs import clusters
+from consat.certify.optimum import cluster_margins, concave_part, max_min
+from consat.certify.quadratics import expand, values_and_gradients
+from consat.problem.graphs import clusters
 from tests.unit.teams import MARGINS, case, grid, many
 
 SOLVER = 1e-7

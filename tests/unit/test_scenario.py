@@ -14,9 +14,9 @@ from scipy.optimize import minimize
 
 import consat as cs
 from consat.errors import InvalidScenario, InvalidTeam
-from consat.graphs import clusters, disconnected, require_connected, task_edges
 from consat.numerics import float64
-from consat.objective import Objective
+from consat.problem.graphs import clusters, disconnected, require_connected, task_edges
+from consat.problem.objective import Objective
 from consat.scenario import Scenario, dump, load, loads, located, packaged, packaged_text, template
 from consat.scenario.document import read
 from consat.scenario.writing import write

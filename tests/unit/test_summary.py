@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.central.assumptions import report
-from consat.central.reference import max_min
+from consat.certify.assumptions import report
+from consat.certify.optimum import max_min
 from consat.runs.summary import status_of
 from consat.views import tables, words
 from tests.unit.teams import case

@@ -25,10 +25,10 @@ from PIL import Image
 import consat as cs
 from consat.errors import InvalidSettings
 from consat.numerics import float64
-from consat.objective import Nu, Objective
-from consat.result import Result
-from consat.teams.team import Team
-from consat.trace import Trace, satisfied_from
+from consat.problem.objective import Nu, Objective
+from consat.problem.team import Team
+from consat.results.result import Result
+from consat.results.trace import Trace, satisfied_from
 from consat.views import animation, figures, scene, words
 
 GREETING = np.array([[2.0, 0.0], [-0.6, 0.0], [-2.0, 0.0]])

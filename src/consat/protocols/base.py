@@ -1,6 +1,6 @@
 """What a protocol is: functions of ONE agent's own state, own objective and disagreement with its neighbours' messages.
 
-Every array has one row a copy the agent holds. `consat.simulate` passes the rows of all agents at once, a networked agent only its own:
+Every array has one row a copy the agent holds. `consat.engine` passes the rows of all agents at once, a networked agent only its own:
 the functions cannot tell, because nothing in their arguments speaks of another agent's constraints.
 """
 
@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
-from consat.interior import Interior
-from consat.prox import Memory
+from consat.protocols.local.interior import Interior
+from consat.protocols.local.proximal import Memory
 
 
 class State(NamedTuple):

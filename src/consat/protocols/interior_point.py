@@ -31,8 +31,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.interior import Gains, Interior, Mail, Memory
 from consat.protocols.base import Known, Solver
+from consat.protocols.local.interior import Gains, Interior, Mail, Memory
 
 
 class InteriorState(NamedTuple):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.protocols.base import Known, Solver
-from consat.prox import Memory
+from consat.protocols.local.proximal import Memory
 
 
 class ProximalState(NamedTuple):

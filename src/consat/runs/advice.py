@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from consat.central.quadratics import Floats, values_and_gradients
-from consat.objective import Nu
+from consat.certify.quadratics import Floats, values_and_gradients
+from consat.problem.objective import Nu
+from consat.problem.team import Team
+from consat.problem.units import Scale
 from consat.protocols import FLOWS, ROUNDS
-from consat.scale import Scale
-from consat.solver import FLAT
-from consat.teams.team import Team
-from consat.trace import Trace
+from consat.protocols.solver import FLAT
+from consat.results.trace import Trace
 
 NAMED = 3
 """So many agents are named in a warning; of more, their number is told."""

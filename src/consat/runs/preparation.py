@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from consat.central.certificate import bounds
-from consat.central.quadratics import shape_of
+from consat.certify.certificate import bounds
+from consat.certify.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings, counted
-from consat.estimates import Estimates, Layout
-from consat.interior import Way, route_of
-from consat.objective import Schedule
+from consat.problem.objective import Schedule
+from consat.problem.team import Team
+from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
-from consat.scale import Scale, automatic, scale, start_box
+from consat.protocols.estimates import Estimates, Layout
+from consat.protocols.local.interior import Way, route_of
 from consat.scenario import Scenario, dump, load
 from consat.settings import ProtocolSettings, Settings, Start
-from consat.teams.team import Team
 
 DEFAULT_PROTOCOL = "interior-point"
 MANY = 5000
@@ -46,7 +46,7 @@ def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
 
 def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
     """The scenario with the auxiliary constraint added to every agent."""
-    from consat.central import assumptions
+    from consat.certify import assumptions
 
     return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
 

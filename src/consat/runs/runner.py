@@ -12,24 +12,24 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from consat.engine import Stop
+from consat.engine import checkpoint as checkpoints
+from consat.engine.files import Files, claim
+from consat.engine.flows import simulate_flow
+from consat.engine.recording import Choice, Who
+from consat.engine.round import Body, Weather
+from consat.engine.rounds import simulate_rounds
 from consat.errors import InvalidSettings
-from consat.estimates import Estimates, Layout
 from consat.numerics import float64
+from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
-from consat.result import RESULT, Result
+from consat.protocols.estimates import Estimates, Layout
+from consat.results.result import RESULT, Result
+from consat.results.trace import Trace
 from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
-from consat.simulate import Stop
-from consat.simulate import checkpoint as checkpoints
-from consat.simulate.files import Files, claim
-from consat.simulate.flows import simulate_flow
-from consat.simulate.kernel import Body, Weather
-from consat.simulate.recording import Choice, Who
-from consat.simulate.rounds import simulate_rounds
-from consat.teams.team import Team
-from consat.trace import Trace
 
 
 def run(

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from consat.central.certificate import BINDING, bounds
+from consat.certify.certificate import BINDING, bounds
 from consat.numerics import float64
+from consat.problem.team import Team
+from consat.problem.units import scale
 from consat.runs.preparation import scenario_of, with_auxiliary
 from consat.runs.summary import number
-from consat.scale import scale
 from consat.scenario import Scenario
-from consat.teams.team import Team
 
 SCHEMA = "consat.solve/1"
 PROVEN = 1e-6
@@ -23,7 +23,7 @@ PROVEN = 1e-6
 
 @float64
 def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> dict[str, Any]:
-    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.central.reference.max_min`.
+    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.certify.optimum.max_min`.
 
     Args:
         team: as in `run`.
@@ -34,8 +34,8 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
         what ``consat solve --json`` prints (schema consat.solve/1): ``proven`` says whether ``bounds`` show that no formation has a better
         margin, ``reasons`` what binds or conflicts, in words.
     """
-    from consat.central.reasons import explain
-    from consat.central.reference import max_min
+    from consat.certify.optimum import max_min
+    from consat.certify.reasons import explain
 
     scenario = scenario_of(team)
     if auxiliary is not None:
@@ -66,6 +66,6 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
 
 def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
     """Says that the auxiliary constraint was added, and on whom it binds: then the radius is too small."""
-    from consat.central.assumptions import binding_auxiliaries
+    from consat.certify.assumptions import binding_auxiliaries
 
     return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
-from consat.central.certificate import bounds
-from consat.objective import Objective, Schedule, weigh
+from consat.certify.certificate import bounds
+from consat.problem.objective import Objective, Schedule, weigh
+from consat.problem.team import Team
+from consat.problem.units import Scale
+from consat.results.trace import Trace
 from consat.runs.advice import warnings_of
-from consat.scale import Scale
 from consat.scenario import Scenario
 from consat.settings import Settings
-from consat.teams.team import Team
-from consat.trace import Trace
 
 SCHEMA = "consat.run/1"
 MOST_LISTED = 10_000

@@ -16,21 +16,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consat import __version__
-from consat.central.certificate import bounds
+from consat.certify.certificate import bounds
+from consat.engine import Stop
+from consat.engine.batch import Case, Lane, Outcome, like, simulate_batch
+from consat.engine.round import Weather, world_of
+from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness
 from consat.errors import InvalidSettings, shown
-from consat.estimates import Layout
 from consat.numerics import float64
+from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
+from consat.protocols.estimates import Layout
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.runs.runner import run
 from consat.runs.summary import number, status_of
 from consat.scenario import Scenario, loads
 from consat.settings import Start
-from consat.simulate import Stop
-from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
-from consat.simulate.kernel import Weather, world_of
-from consat.simulate.rounds import PATIENCE, Rules, longest_hold, stillness
-from consat.teams.team import Team
 
 SCHEMA = "consat.sweep/1"
 MOST_LISTED = 10_000

@@ -10,12 +10,12 @@ from importlib import resources
 from pathlib import Path
 
 from consat.errors import Fault, InvalidInput, InvalidScenario, closest
+from consat.problem.team import Team
 from consat.scenario.document import LARGEST, Document, decode, locate, read
 from consat.scenario.overrides import override
 from consat.scenario.schema import build
 from consat.scenario.writing import write
 from consat.settings import Settings
-from consat.teams.team import Team
 
 _PACKAGE = resources.files("consat.scenario")
 

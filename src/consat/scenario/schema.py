@@ -1,4 +1,4 @@
-"""Plain data as a team and its settings. What a value may be is known to `consat.teams.team` and `consat.settings`; here stand the keys."""
+"""Plain data as a team and its settings: the keys. What a value may be is known to `consat.problem.team` and `consat.settings`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from consat.constraints import KINDS
 from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidTeam, closest, counted, shown
+from consat.problem.constraints import KINDS
+from consat.problem.groups import MOST, Each, Group
+from consat.problem.team import Agent, Links, Team
 from consat.scenario.document import Document, Path
 from consat.scenario.words import complaints, unknown_key
 from consat.settings import Settings
-from consat.teams.groups import MOST, Each, Group
-from consat.teams.team import Agent, Links, Team
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")

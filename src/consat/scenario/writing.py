@@ -14,14 +14,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from consat.constraints import KINDS, OWNER, Constraint, box
 from consat.errors import Fault, InvalidTeam
+from consat.problem.constraints import KINDS, OWNER, Constraint, box
+from consat.problem.family import Family
+from consat.problem.groups import Each, Group
+from consat.problem.team import TOPOLOGIES, Team, topology
 from consat.scenario.document import resolve
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
-from consat.teams.family import Family
-from consat.teams.groups import Each, Group
-from consat.teams.team import TOPOLOGIES, Team, topology
 
 WIDTH: Final = 110
 """Lists and mappings up to this many characters stand on one line."""

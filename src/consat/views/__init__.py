@@ -1,1 +1,1 @@
-"""What people look at: pure functions of a `consat.result.Result`. Nothing here loads matplotlib before a figure is asked for."""
+"""What people look at: pure functions of a `consat.results.result.Result`. Nothing here loads matplotlib before a figure is asked for."""

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from consat.errors import InvalidSettings
-from consat.result import Result
+from consat.results.result import Result
 from consat.views.scene import Scene, moments
 
 MOVEMENT = 0.75  # share of a film that goes by the way travelled, the rest by the clock: most happens in the first seconds

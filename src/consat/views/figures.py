@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from consat.numerics import float64
-from consat.result import Result
-from consat.teams.team import Team
+from consat.problem.team import Team
+from consat.results.result import Result
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from consat.result import Result
-from consat.teams.team import Team
+from consat.problem.team import Team
+from consat.results.result import Result
 from consat.views.figures import GREY, STYLES, colour, grid, marker, number, plain, recorded, regions, view
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000

@@ -24,7 +24,7 @@ ANSWER = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]open[/]"}
 
 
 def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """The findings of `consat.central.assumptions.report`, for people."""
+    """The findings of `consat.certify.assumptions.report`, for people."""
     clusters = findings["clusters"]
     shape = [
         counted(findings[key], noun) for key, noun in (("count", "agent"), ("constraint_count", "constraint"), ("cluster_count", "cluster"))

@@ -1,0 +1,303 @@
+"""What is proven of a team: bounds on the best margin any formation can have, and the verdict that follows.
+
+Let ψ_k be concave, λ ≥ 0 with Σ λ = 1. A formation x that is better than x̂ has β̄(x) ≤ Σ λ_k ψ_k(x), and, as this sum is concave,
+
+    β̄(x) ≤ q(z) + ∇q(z)·(x − z) ≤ q(z) + Σ_i ‖∇_i q(z)‖ (R_i + ‖z_i − x̂_i‖),    q = Σ λ_k ψ_k,
+
+for ANY point z, R_i being how far better formations lie at most (`levels`). So no solver need be trusted: λ and z only decide how
+sharp the bound is. z is Newton's maximiser of q, exact for quadratics; λ are softmax weights at x̂ over a ladder of ν, those at points
+found by climbing centrally (`refine`), and whatever the caller brings. Constraints that are not concave get no weight: what proves that
+the others cannot hold together proves it of all. Clusters have bounds of their own; those of the team are the smallest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from consat.certify.conic import normalised, units
+from consat.certify.levels import radii, with_tangents
+from consat.certify.optimum import middle
+from consat.certify.quadratics import Expansion, Floats, Ints, expand, shape_of
+from consat.numerics import float64
+from consat.problem.graphs import clusters
+from consat.problem.objective import Nu, Objective, evaluate, weigh
+from consat.problem.team import Team
+
+Verdict = Literal["feasible", "infeasible", "undecided"]
+
+RUNGS = 4.0 ** np.arange(0, 7)
+"""ν times the scale of ψ: from weights that see every constraint to those that see only the worst."""
+LARGE = 200_000
+"""Beyond so many coordinates a team is certified by the part of it that lies about its worst constraint: …"""
+STEPS = 8
+"""… so many constraints away, …"""
+MOST_TAKEN = 2000
+"""… or when there are so many agents."""
+BLEND = 1e-3
+"""How much of the softest weights every other rung keeps: underflowed weights leave agents without curvature."""
+REFINEMENT = 4.0 ** np.arange(0, 8)
+"""As `RUNGS`, where the climb has gone along."""
+CLIMB = 12
+"""Newton steps at each ν of the refinement, at most."""
+DENSE = 60
+"""Up to so many coordinates a dense factorisation is the quicker one."""
+EPS = float(np.finfo(float).eps)
+ROUNDINGS = 64
+"""Allowance for the roundings within a term of a sum, in units of `EPS` and of the sizes that went into it; the sum adds one a term."""
+BINDING = 1e-3
+"""A multiplier below this does not count as binding."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Bounds on β̄*, the best margin any formation of the team can have.
+
+    Attributes:
+        lower: β̄ at the formation in hand; +∞ for a team without constraints.
+        upper: proven; None if nothing is.
+        multipliers: (M,) λ that prove `upper`; they sum to 1 within every cluster that has concave constraints.
+        verdict: ``feasible`` if the formation in hand satisfies all, ``infeasible`` if `upper` ≤ 0, else ``undecided``.
+        binding: places of the constraints that λ rests on, the heaviest first.
+        clusters: (C, 2) lower and upper bound of every cluster, +∞ where there are no constraints or nothing is proven.
+    """
+
+    lower: float
+    upper: float | None
+    multipliers: Floats
+    verdict: Verdict
+    binding: Ints
+    clusters: Floats
+
+
+@float64
+def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = True, multipliers: Floats | None = None) -> Certificate:
+    """Certify a formation.
+
+    Args:
+        team: the team.
+        positions: (N, d) x̂, length.
+        nu: the ν of a run, whose own weights are then tried, too.
+        refine: climb from x̂ centrally to sharpen the upper bound; without, it costs about as much as a dozen evaluations of the team.
+        multipliers: (M,) weights to try, such as those of `consat.certify.optimum.max_min`.
+    """
+    x = np.asarray(positions, dtype=float)
+    if not len(team.owner):
+        return Certificate(np.inf, None, np.zeros(0), "feasible", np.zeros(0, dtype=np.intp), np.full((team.count, 2), np.inf))
+    if x.size > LARGE and np.isfinite(x).all():
+        return _about_the_worst(team, x, nu, refine)
+    with np.errstate(over="ignore", invalid="ignore"):
+        model = expand(team, x) if np.isfinite(x).all() else None
+        lower = -np.inf if model is None else float(model.value.min())
+        if model is not None and lower == -np.inf:  # what is proven elsewhere holds all the same
+            model = expand(team, middle(team))
+        if model is None or not np.isfinite(model.value).all():
+            return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+        proof = _Proof(team, model)
+        proof.ladder(nu, multipliers)
+        if refine:
+            proof.climb()
+    upper = float(proof.upper.min())
+    verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper <= 0 else "undecided"
+    heavy = np.flatnonzero(proof.best > BINDING)
+    order = heavy[np.argsort(-proof.best[heavy], kind="stable")]
+    each = np.stack([proof.margins, proof.upper], axis=1)
+    return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, verdict, order, each)
+
+
+def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Certificate:
+    """Certify a large team by a part of it: what bounds the margin of some of the constraints bounds that of all."""
+    values = np.asarray(evaluate(Objective.at_positions(team), jnp.asarray(x)))
+    if not np.isfinite(values).all():
+        return Certificate(-np.inf, None, np.zeros(len(values)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+    mine = np.zeros(team.count, dtype=bool)
+    mine[team.owner[int(np.argmin(values))]] = True
+    for _ in range(STEPS):
+        if np.count_nonzero(mine) > MOST_TAKEN:
+            break
+        for family in team.families:
+            mine[family.agents[mine[family.agents].any(axis=1)]] = True
+    agents = np.flatnonzero(mine)
+    part, numbers = team.part(agents)
+    found = bounds(part, x[agents], nu, refine)
+    lower, upper = float(values.min()), found.upper
+    upper = None if upper is None else max(upper, lower)
+    multipliers = np.zeros(len(values))
+    multipliers[numbers] = found.multipliers
+    cluster = clusters(team)
+    each = np.full((int(cluster.max()) + 1, 2), np.inf)
+    np.minimum.at(each[:, 0], cluster[team.owner], values)
+    own = clusters(part)
+    each[cluster[agents[np.unique(own, return_index=True)[1]]], 1] = found.clusters[:, 1]
+    verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper is not None and upper <= 0 else "undecided"
+    return Certificate(lower, upper, multipliers, verdict, numbers[found.binding], each)
+
+
+class _Proof:
+    """The best bound of every cluster so far, and the λ that gives it."""
+
+    def __init__(self, team: Team, model: Expansion) -> None:
+        shape, self.cluster = shape_of(team), clusters(team)
+        self.team, self.group, self.count = team, self.cluster[team.owner], int(self.cluster.max()) + 1
+        self.concave, self.exact = shape.concave, bool((shape.quadratic | ~shape.concave).all())
+        self.model = model.keep(self.concave)
+        margins = np.full(self.count, np.inf)
+        np.minimum.at(margins, self.group, model.value)
+        self.margins = margins
+        unit = units(self.model, self.group, self.count)
+        self.psi = unit.psi[self.group]
+        known, lower = self.model, margins[self.group]
+        if not self.exact:
+            known, lower = with_tangents(team, known, lower, self.concave & ~shape.quadratic, float(unit.length.max()))
+        self.radius = radii(known, lower, self.cluster)
+        self.rounding = EPS * (ROUNDINGS + np.bincount(self.group, minlength=self.count))[self.group]
+        degree = np.zeros(team.count)
+        for family in team.families:
+            degree += np.bincount(family.agents.ravel(), minlength=team.count)
+        self.roughness = EPS * (ROUNDINGS + degree)
+        self.upper = np.full(self.count, np.inf)
+        self.best = np.zeros(len(self.group))
+
+    def weights(self, values: Floats, nu: Floats | float) -> Floats:
+        """Softmax weights of the concave constraints within each cluster."""
+        exponent = np.where(self.concave & np.isfinite(values), -nu * values, -np.inf)
+        top = np.full(self.count, -np.inf)
+        np.maximum.at(top, self.group, exponent)
+        return normalised(np.exp(exponent - np.where(np.isfinite(top), top, 0.0)[self.group]), self.group, self.count)
+
+    def ladder(self, nu: Nu | None, multipliers: Floats | None) -> None:
+        """Weights at x̂ itself."""
+        soft = self.weights(self.model.value, 1.0 / self.psi)
+        candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in RUNGS]
+        if nu is not None:
+            own = np.asarray(weigh(Objective.at_positions(self.team), jnp.asarray(self.model.at), nu)[1])
+            candidates.append(normalised(np.where(self.concave, own, 0.0), self.group, self.count))
+        if multipliers is not None:
+            candidates.append(normalised(np.where(self.concave, multipliers, 0.0), self.group, self.count))
+        for weights in candidates:
+            self.consider(self.model, weights)
+
+    def climb(self) -> None:
+        """Weights at maximisers of β over a rising ν, by Newton's method from x̂ on."""
+        model = self.model
+        central = expand(self.team, middle(self.team)).keep(self.concave)
+        soft = 1.0 / self.psi
+        ahead = self.smooth(central.value, soft) > self.smooth(model.value, soft)
+        if ahead.any():
+            model = expand(self.team, np.where(ahead[self.cluster][:, None], central.at, model.at)).keep(self.concave)
+        for rung in REFINEMENT:
+            nu = rung / self.psi
+            for _ in range(CLIMB):
+                weights = self.weights(model.value, nu)
+                step, promise = self.newton(model, weights, nu)
+                if not promise.any():
+                    break
+                model, moved = self.line_search(model, step, promise, rung)
+                if not moved:
+                    break
+            self.consider(model, self.weights(model.value, nu))
+
+    def newton(self, model: Expansion, weights: Floats, nu: Floats) -> tuple[Floats, Floats]:
+        """The step for β, and its slope along it in each cluster; 0 where there is nothing left to gain."""
+        slope = model.gradient(weights)
+        jacobian = model.jacobian()
+        bend = -model.hessian(weights) + (jacobian.T @ (sparse.diags_array(nu * weights) @ jacobian))
+        step = _solve(bend, slope.ravel(), 1e-12).reshape(slope.shape)
+        promise = np.bincount(self.cluster, np.sum(slope * step, axis=1), minlength=self.count)
+        psi = np.ones(self.count)
+        psi[self.group] = self.psi
+        return step, np.where(promise > 1e-14 * psi, promise, 0.0)
+
+    def line_search(self, model: Expansion, step: Floats, promise: Floats, rung: float) -> tuple[Expansion, bool]:
+        """Halve the step of each cluster until β rises."""
+        nu, length = rung / self.psi, np.where(promise > 0, 1.0, 0.0)
+        before = self.smooth(model.value, nu)
+        for _ in range(30):
+            after = expand(self.team, model.at + length[self.cluster][:, None] * step).keep(self.concave)
+            value = self.smooth(np.where(np.isfinite(after.value), after.value, -np.inf), nu)
+            short = (length > 0) & ~(value >= before + 0.1 * length * promise - ROUNDINGS * EPS * np.abs(before))
+            if not short.any():
+                return after, bool((length > 0).any())
+            length = np.where(short, 0.5 * length, length)
+        return model, False
+
+    def smooth(self, values: Floats, nu: Floats) -> Floats:
+        """(C,) β of each cluster's concave constraints."""
+        low = np.full(self.count, np.inf)
+        np.minimum.at(low, self.group, np.where(self.concave, values, np.inf))
+        base = np.where(np.isfinite(low), low, 0.0)
+        total = np.bincount(self.group, np.where(self.concave, np.exp(-nu * (values - base[self.group])), 0.0), minlength=self.count)
+        sharp = np.ones(self.count)
+        sharp[self.group] = nu
+        return np.where(total > 0, low - np.log(np.where(total > 0, total, 1.0)) / sharp, low)
+
+    def consider(self, model: Expansion, weights: Floats) -> None:
+        """Take, in each cluster, what λ proves if that is better than what is proven."""
+        self.settle(model, np.zeros(model.at.shape), weights)
+        bend, slope = -model.hessian(weights), model.gradient(weights)
+        damping = 1e-14
+        for _ in range(4):
+            step = _solve(bend, slope.ravel(), damping).reshape(slope.shape)
+            self.settle(model, step, weights)
+            if not (np.linalg.norm(step, axis=1) > 10 * self.radius).any():
+                break
+            damping *= 1e4  # a direction without curvature: go no farther than a better formation can lie
+
+    def settle(self, model: Expansion, step: Floats, weights: Floats) -> None:
+        """The bound that λ gives with z = model.at + step."""
+        if not self.exact and step.any():
+            model, step = expand(self.team, model.at + step).keep(self.concave), np.zeros_like(step)
+        values, slope = model.values(step), model.gradient(weights, step)
+        away = np.linalg.norm(model.at + step - self.model.at, axis=1)
+        size, rough = _sizes(model, step, weights)
+        left = np.linalg.norm(slope, axis=1) + self.roughness * rough
+        reach = np.where(left > 0, left * np.where(left > 0, self.radius + away, 0.0), 0.0)
+        terms = weights * (values + self.rounding * size)
+        bound = np.bincount(self.group, np.where(weights > 0, terms, 0.0), minlength=self.count)
+        bound += np.bincount(self.cluster, reach, minlength=self.count)
+        total = np.bincount(self.group, weights, minlength=self.count)
+        unknown = np.bincount(self.group, (weights > 0) & ~model.known, minlength=self.count) > 0  # no tangent, no bound
+        bound = np.where((total > 0.5) & ~unknown & ~np.isnan(bound), np.maximum(bound, self.margins), np.inf)
+        better = bound < self.upper
+        self.upper = np.where(better, bound, self.upper)
+        self.best = np.where(better[self.group], weights, self.best)
+
+
+def _sizes(model: Expansion, step: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """(M,) the sizes of the terms summed into each ψ and (N,) those summed into Σ λ∇ψ: what roundings are relative to."""
+    size, rough = np.abs(model.value), np.zeros(model.size)
+    far, flat = np.abs(model.at).ravel(), np.abs(step).ravel()
+    for block in model.blocks:
+        bend = np.matmul(np.abs(block.hessian), (far + flat)[block.columns][..., None])[..., 0]
+        slope = np.abs(block.gradient) + bend
+        size[block.number] += np.sum(np.abs(block.gradient) * far[block.columns] + slope * flat[block.columns], axis=1)
+        rough += np.bincount(block.columns.ravel(), (weights[block.number][:, None] * slope).ravel(), minlength=model.size)
+    return size, np.sqrt(np.sum(rough.reshape(model.at.shape) ** 2, axis=1))
+
+
+def _solve(bend: sparse.csc_array, slope: Floats, damping: float) -> Floats:
+    """(bend + δ)⁻¹ slope, δ relative to the largest entry."""
+    diagonal = bend.diagonal()
+    largest = float(diagonal.max(initial=0.0))
+    if not largest > 0:
+        return np.zeros_like(slope)
+    if len(slope) <= DENSE:
+        dense = bend.toarray()
+        dense[np.diag_indices(len(slope))] += damping * largest
+        return _dense(dense, slope)
+    factor = splu((bend + sparse.diags_array(np.full(len(slope), damping * largest))).tocsc(), permc_spec="MMD_AT_PLUS_A")
+    step: Floats = factor.solve(slope)
+    return np.where(np.isfinite(step), step, 0.0)
+
+
+def _dense(matrix: Floats, slope: Floats) -> Floats:
+    try:
+        step = np.asarray(np.linalg.solve(matrix, slope), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.zeros_like(slope)
+    return np.where(np.isfinite(step), step, 0.0)

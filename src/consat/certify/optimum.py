@@ -1,0 +1,234 @@
+"""The centralised optimum: the best margin any formation can have, and a formation that has it.
+
+    β̄* = max_x min_k ψ_k(x)
+
+Clusters are independent, so each is maximised for itself, and β̄* is the worst of them.
+
+* All ψ concave of degree ≤ 2: one cone program (`conic`), exact.
+* Otherwise starts climb β by ν-continuation (`ascent`), and the best is polished: ψ_k is replaced by its value, gradient and the
+  concave part of its Hessian, and that cone program is solved within a trust region, again and again. Where ψ is a quadratic the
+  replacement lies below it, so that steps only ever gain (the convex–concave procedure: Lipp, Boyd 2016); where ψ is concave it is exact
+  to second order, so that they converge superlinearly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import eye_array
+from scipy.sparse.linalg import splu
+
+from consat.certify.ascent import climb, drawn
+from consat.certify.conic import Solution, maximise, units
+from consat.certify.quadratics import Bools, Expansion, Floats, Ints, expand, shape_of, values_and_gradients
+from consat.problem.graphs import clusters
+from consat.problem.team import Team
+from consat.problem.units import scale
+
+STARTS = 32
+"""Starts for a team that is not concave."""
+POLISHED = 3
+"""How many of the best starts of each cluster are polished."""
+MOST_VALUES = 4_000_000
+"""Starts are so many that no more than this many ψ are held at once."""
+ROUNDS = 60
+"""Cone programs at most in polishing one start."""
+SETTLED = 1e-9
+"""Polishing ends when a step promises less than this, in units of ψ; the cone programs resolve no more."""
+AGAIN = 3
+"""Steps of the exact solution at most."""
+FAR = 1e3
+"""A step longer than this, in lengths, is taken up again from where it ended: digits were lost."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best formation known.
+
+    Attributes:
+        positions: (N, d), length.
+        margin: β̄ at `positions`; +∞ for a team without constraints.
+        multipliers: (M,) how much each constraint binds; they sum to 1 within every cluster.
+        method: how it was found, and how far to trust it, in words.
+        exact: whether `margin` is the best possible (up to the solver's tolerance).
+        unbounded: whether the margin can be made as large as one likes; `positions` is then one formation of many.
+    """
+
+    positions: Floats
+    margin: float
+    multipliers: Floats
+    method: str
+    exact: bool
+    unbounded: bool = False
+
+
+def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
+    """Maximise the margin of a team.
+
+    Args:
+        team: the team.
+        starts: how many starts, for a team that is not concave quadratic.
+        seed: of the starts.
+    """
+    shape, cluster = shape_of(team), clusters(team)
+    first = middle(team)
+    if not len(team.owner):
+        return Optimum(first, np.inf, np.zeros(0), "no constraints", exact=True)
+    if shape.quadratic.all() and shape.concave.all():
+        return _quadratic(team, cluster, first)
+    return _smooth(team, cluster, first, starts, seed, concave=bool(shape.concave.all()))
+
+
+def cluster_margins(team: Team, values: Floats, cluster: Ints) -> Floats:
+    """(C,) the smallest of the (M,) ψ in each cluster, +∞ where there is none."""
+    margins = np.full(int(cluster.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(margins, cluster[team.owner], values)
+    return margins
+
+
+def middle(team: Team) -> Floats:
+    """(N, d) where Σ ψ, over the concave quadratics, is largest: near enough to the optimum to compute from. Agents that this leaves
+    open are at their start, or at the centre of the team."""
+    shape, size = shape_of(team), scale(team)
+    x = np.where(np.isnan(team.starts), size.center, team.starts)
+    usable = shape.quadratic & shape.concave
+    for _ in range(2):  # the second pass makes up for digits lost where the first began far away
+        model = expand(team, x).keep(usable)
+        weights = _inverse_bend(model)
+        bend = -model.hessian(weights)
+        damping = 1e-9 * np.maximum(bend.diagonal(), 1.0)
+        curved = bend.diagonal() > 0
+        step = splu((bend + eye_array(model.size) * damping.max()).tocsc()).solve(np.where(curved, model.gradient(weights).ravel(), 0.0))
+        x = x + np.where(curved, step, 0.0).reshape(x.shape)
+    return x
+
+
+def _inverse_bend(model: Expansion) -> Floats:
+    weights = np.zeros(len(model.value))
+    for block in model.blocks:
+        norm = np.linalg.norm(block.hessian, axis=(1, 2))
+        weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
+    return weights
+
+
+def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
+    group = cluster[team.owner]
+    model = expand(team, x)
+    solution = maximise(model, cluster, group)
+    for _ in range(AGAIN):
+        if solution.status != "solved":
+            break
+        x = x + solution.step
+        far = (np.abs(solution.step).max(axis=1) > FAR * units(model, group, int(cluster.max()) + 1).length[cluster]).any()
+        model = expand(team, x)
+        if not far:
+            break
+        solution = maximise(model, cluster, group)
+    if solution.status == "unbounded":
+        return _limitless(team, cluster, model)
+    if solution.status == "failed":
+        return _smooth(team, cluster, x, None, 0, concave=True)
+    margin = float(values_and_gradients(team, x)[0].min())
+    return Optimum(x, margin, solution.multipliers, "concave quadratic constraints: exact, by one cone program (Clarabel)", exact=True)
+
+
+def _limitless(team: Team, cluster: Ints, model: Expansion) -> Optimum:
+    """Some clusters have no best margin: these stop at one that is ample, at least as good as that of the others."""
+    group = cluster[team.owner]
+    count = int(cluster.max()) + 1
+    unit, has = units(model, group, count), np.bincount(group, minlength=count) > 0
+    open_ = has.copy()
+    ceiling = np.ones(count)
+    ample = maximise(model, cluster, group, ceiling=ceiling)
+    open_ &= cluster_margins(team, model.values(ample.step), cluster) > 0.99 * unit.psi
+    for c in np.flatnonzero(open_):
+        alone = maximise(model.keep(group == c), cluster, group)
+        if alone.status == "solved":
+            ample = _replaced(ample, alone, cluster == c, group == c)
+            open_[c] = False
+    worst = float(np.min(cluster_margins(team, model.values(ample.step), cluster), initial=np.inf, where=has & ~open_))
+    if np.isfinite(worst):
+        ceiling = np.maximum(1.0, 2.0 * worst / unit.psi)
+        higher = maximise(model.keep(open_[group]), cluster, group, ceiling=ceiling)
+        ample = _replaced(ample, higher, open_[cluster], open_[group])
+    x = model.at + ample.step
+    margin = float(values_and_gradients(team, x)[0].min())
+    if np.isfinite(worst):
+        method = "concave quadratic constraints: exact, by one cone program (Clarabel); some clusters could have any margin"
+        return Optimum(x, margin, ample.multipliers, method, exact=True)
+    return Optimum(x, margin, ample.multipliers, "the margin can be made as large as one likes", exact=False, unbounded=True)
+
+
+def _replaced(solution: Solution, by: Solution, agents: Bools, constraints: Bools) -> Solution:
+    step = np.where(agents[:, None], by.step, solution.step)
+    return Solution(step, np.where(constraints, by.multipliers, solution.multipliers), solution.status)
+
+
+def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: int, *, concave: bool) -> Optimum:
+    size = scale(team)
+    wanted = starts or (4 if concave else STARTS)
+    count = max(1, min(wanted, MOST_VALUES // max(len(team.owner), 1)))
+    formations, margins = climb(team, np.concatenate([first[None], drawn(team, count - 1, seed, size)]), cluster, size)
+    order = np.argsort(-margins, axis=0, kind="stable")
+    best: tuple[Floats, Floats, Floats, Bools] | None = None
+    for rank in range(min(1 if concave else POLISHED, count)):
+        x = formations[order[rank][cluster], np.arange(team.count)]
+        polished, multipliers, settled = _polish(team, cluster, x)
+        reached = cluster_margins(team, values_and_gradients(team, polished)[0], cluster)
+        if best is None:
+            best = polished, multipliers, reached, settled
+            continue
+        gained = reached > best[2]
+        best = (
+            np.where(gained[cluster][:, None], polished, best[0]),
+            np.where(gained[cluster[team.owner]], multipliers, best[1]),
+            np.maximum(reached, best[2]),
+            np.where(gained, settled, best[3]),
+        )
+    assert best is not None
+    found = f"best of {count} starts, ν-continuation and sequential cone programs (Clarabel)"
+    if not concave:
+        return Optimum(best[0], float(best[2].min()), best[1], found, exact=False)
+    exact = bool(best[3].all() and (best[2] > -np.inf).all())
+    note = "concave constraints: exact" if exact else "concave constraints, not converged"
+    return Optimum(best[0], float(best[2].min()), best[1], f"{note}, {found}", exact=exact)
+
+
+def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools]:
+    """A local max-min from x: positions, multipliers, and (C,) whether it settled."""
+    group = cluster[team.owner]
+    model = concave_part(expand(team, x))
+    unit = units(model, group, int(cluster.max()) + 1)
+    trust, margins = unit.length.copy(), cluster_margins(team, model.value, cluster)
+    multipliers, settled = np.zeros(len(group)), np.zeros(len(trust), dtype=bool)
+    for _ in range(ROUNDS):
+        solution = maximise(model, cluster, group, trust=trust[cluster])
+        if solution.status != "solved":
+            break
+        multipliers = solution.multipliers
+        after = cluster_margins(team, values_and_gradients(team, x + solution.step)[0], cluster)
+        with np.errstate(invalid="ignore"):  # a cluster without constraints has margin ∞ before and after
+            promised = np.where(margins == -np.inf, np.inf, cluster_margins(team, model.values(solution.step), cluster) - margins)
+            settled = ~(promised > SETTLED * unit.psi)
+            gain = after - margins
+            accepted = gain > 0
+            trust = np.where(gain > 0.5 * promised, 3.0, np.where(gain > 0.1 * promised, 1.0, 0.25)) * trust
+        x = np.where(accepted[cluster][:, None], x + solution.step, x)
+        margins = np.where(accepted, after, margins)
+        settled |= trust < SETTLED * unit.length
+        if settled.all():
+            break
+        model = concave_part(expand(team, x))
+    return x, multipliers, settled
+
+
+def concave_part(model: Expansion) -> Expansion:
+    """The same with the positive eigenvalues of every Hessian left out."""
+    blocks = []
+    for block in model.blocks:
+        eigenvalues, vectors = np.linalg.eigh(block.hessian)
+        negative = np.minimum(eigenvalues, 0.0)[:, None, :] * vectors
+        blocks.append(dataclasses.replace(block, hessian=np.matmul(negative, np.swapaxes(vectors, 1, 2))))
+    return Expansion(model.at, model.value, tuple(blocks))

@@ -1,0 +1,290 @@
+"""Why a team cannot do better, in words: which constraints conflict or bind, and what the least change is that would help.
+
+Multipliers say which constraints fight, and by how much the margin rises as one of them gives way: dβ̄*/dp = λ_k ∂ψ_k/∂p. That is where
+to look, not what is said: a conflict is stated only if the constraints named, on their own, are proven incompatible, and a cure only if the
+team with that change, solved again, satisfies every constraint of the cluster.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from consat.certify.certificate import BINDING, bounds
+from consat.certify.optimum import Optimum, cluster_margins, max_min
+from consat.certify.quadratics import Bools, Floats, values_and_gradients
+from consat.numerics import float64
+from consat.problem.family import Family
+from consat.problem.graphs import clusters
+from consat.problem.team import Team
+
+NAMED = 6
+"""A conflict of more constraints than this is summed up by its heaviest."""
+TRIED = 3
+"""How many of the binding constraints are tried as the one to relax."""
+SOLVES = 12
+"""Solutions at most in looking for the least relaxation of one constraint."""
+MOST_SOLVED = 2000
+"""Above this many constraints in a cluster no cure is looked for: each try is a solution of its own."""
+LEAST = 1e-6
+"""No relaxation is proposed below this part of the number relaxed."""
+DIGITS = 2
+"""A proposed change is rounded up to so many significant digits."""
+
+
+@dataclass(frozen=True)
+class _Knob:
+    """One number of one constraint, and the way it must turn to relax it.
+
+    Attributes:
+        constraint: its place in the team's order.
+        parameter: of its family; "" stands for the value of ψ itself.
+        entry: index into that parameter.
+        now: its value.
+        gain: dβ̄*/d(turn), > 0.
+        sign: +1 or −1.
+    """
+
+    constraint: int
+    parameter: str
+    entry: tuple[int, ...]
+    now: float
+    gain: float
+    sign: float
+
+
+def explain(team: Team, optimum: Optimum) -> list[str]:
+    """Sentences about what limits a team, cluster by cluster.
+
+    Args:
+        team: the team.
+        optimum: what `consat.certify.optimum.max_min` found for it.
+    """
+    if not len(team.owner):
+        return ["No agent has a constraint."]
+    if optimum.unbounded:
+        return ["Nothing limits the margin: the constraints can hold with any margin one likes."]
+    cluster = clusters(team)
+    values = values_and_gradients(team, optimum.positions)[0]
+    margins = cluster_margins(team, values, cluster)
+    sentences: list[str] = []
+    for c in np.flatnonzero(margins < np.inf):
+        mine = cluster[team.owner] == c
+        if margins[c] == -np.inf:
+            nowhere = np.flatnonzero(mine & (values == -np.inf)).tolist()
+            sentences.append(f"No formation was found at which ψ of {_listed(team, nowhere)} is a finite number.")
+        elif margins[c] <= 0:
+            sentences += _conflict(team, optimum, mine, float(margins[c]))
+    if not sentences:
+        worst = int(np.argmin(margins))
+        binding = _binding(optimum.multipliers, cluster[team.owner] == worst)
+        best = "best margin" if optimum.exact else "best margin found"
+        sentences.append(f"Every constraint can hold. The {best} is {_number(optimum.margin)}, limited by {_listed(team, binding)}.")
+    return sentences
+
+
+def _binding(multipliers: Floats, mine: Bools) -> list[int]:
+    """Which constraints bind, the strongest first: in a large team each bears a small part."""
+    heavy = np.flatnonzero(mine & (multipliers > BINDING * np.max(multipliers[mine], initial=0.0)))
+    return [int(k) for k in heavy[np.argsort(-multipliers[heavy], kind="stable")]]
+
+
+def _conflict(team: Team, optimum: Optimum, mine: Bools, margin: float) -> Iterator[str]:
+    binding = _binding(optimum.multipliers, mine)
+    chosen = np.zeros(len(team.owner), dtype=bool)
+    chosen[binding] = True
+    if _infeasible(team, optimum, chosen):
+        together = {1: "", 2: "both "}.get(len(binding), "all ")
+        sentence = f"{_listed(team, binding)} cannot {together}hold: the best margin is {_number(margin)}."
+    elif _infeasible(team, optimum, mine):
+        sentence = f"Not all constraints can hold: the best margin is {_number(margin)}. In the way are {_listed(team, binding)}."
+    else:
+        sentence = f"No formation was found in which {_listed(team, binding)} hold together: the best margin found is {_number(margin)}."
+    cure = _cure(restricted(team, mine), optimum.multipliers[mine], optimum.positions, margin) if mine.sum() <= MOST_SOLVED else None
+    yield f"{sentence} {cure}" if cure else sentence
+
+
+def _infeasible(team: Team, optimum: Optimum, keep: Bools) -> bool:
+    """Whether some of the constraints are proven incompatible, whatever the others say."""
+    return bounds(restricted(team, keep), optimum.positions, multipliers=optimum.multipliers[keep]).verdict == "infeasible"
+
+
+def _cure(team: Team, multipliers: Floats, positions: Floats, margin: float) -> str | None:
+    """The least relaxation, of the constraint with the best leverage, that is seen to satisfy a cluster."""
+    knobs = sorted(_knobs(team, multipliers, positions), key=lambda knob: -knob.gain * max(abs(knob.now), 1e-300))
+    for knob in knobs[:TRIED]:
+        amount = _least(functools.partial(_margin, team, knob), -margin / knob.gain, LEAST * (abs(knob.now) or 1.0), margin)
+        if amount is not None:
+            return _proposal(team, knob, amount)
+    return None
+
+
+def _margin(team: Team, knob: _Knob, amount: float) -> float:
+    return max_min(turned(team, knob, amount)).margin
+
+
+def _least(solve: Callable[[float], float], guess: float, least: float, margin: float) -> float | None:
+    """The smallest amount from `least` on, rounded up, whose margin is positive; None if none is found. The margin rises with it."""
+    low, high, below = 0.0, max(guess, least), margin
+    for tries in range(SOLVES):
+        above = solve(high)
+        if above > 0:
+            break
+        if not math.isfinite(above) or (above <= below + 1e-9 * abs(margin) and tries > 1):
+            return None  # it no longer helps: something else is in the way
+        slope = (above - below) / (high - low)
+        low, high, below = high, min(high + 1.05 * abs(above) / slope, 4 * high) if slope > 0 else 2 * high, above
+    else:
+        return None
+    for _ in range(SOLVES):
+        rounded = _rounded_up(low) if low else 0.0
+        if rounded >= _rounded_up(high) or high <= least:
+            break
+        middle = low + (high - low) * max(0.1, min(0.9, -below / (above - below)))
+        value = solve(middle)
+        if value > 0:
+            high, above = middle, value
+        else:
+            low, below = middle, value
+    amount = _rounded_up(high)
+    return amount if solve(amount) > 0 else None
+
+
+def _rounded_up(amount: float) -> float:
+    step = 10.0 ** (math.floor(math.log10(amount)) + 1 - DIGITS)
+    return float(f"{math.ceil(amount / step * (1 - 1e-12)) * step:.{DIGITS}g}")
+
+
+@float64
+def _knobs(team: Team, multipliers: Floats, positions: Floats) -> list[_Knob]:
+    """What can be turned: a radius, an offset, the side of a box; otherwise how far ψ may fall short."""
+    knobs = []
+    for family in team.families:
+        for member in np.flatnonzero(multipliers[family.number] > BINDING):
+            k = int(family.number[member])
+            weight, parameters = float(family.weight[member]), {key: value[member] for key, value in family.parameters.items()}
+            slopes = _slopes(family, positions[family.agents[member]], parameters)
+            options = [
+                (abs(slope), name, entry, slope)
+                for name in ("radius", "offset", "low", "high")
+                if name in parameters
+                for entry, slope in np.ndenumerate(slopes[name])
+                if slope != 0 and math.isfinite(slope)
+            ]
+            if family.kind in STANDARD and options:
+                _, name, entry, slope = max(options)
+                now = float(parameters[name][entry])
+                knobs.append(_Knob(k, name, entry, now, multipliers[k] * weight * abs(slope), math.copysign(1.0, slope)))
+            else:
+                values = values_and_gradients(team, positions)[0]
+                size = float(np.abs(values[np.isfinite(values)]).max(initial=0.0)) / weight
+                knobs.append(_Knob(k, "", (), size, multipliers[k] * weight, 1.0))
+    return knobs
+
+
+STANDARD = ("within", "outside", "near", "apart", "displacement", "halfspace", "box")
+"""Kinds whose parameters mean what their names say."""
+
+
+def _slopes(family: Family, arguments: Floats, parameters: dict[str, Any]) -> dict[str, Floats]:
+    """∂ψ/∂p of one member for each of its parameters."""
+    inexact = {key: jnp.asarray(value) for key, value in parameters.items() if np.issubdtype(np.asarray(value).dtype, np.floating)}
+    fixed = {key: value for key, value in parameters.items() if key not in inexact}
+
+    def psi(varied: dict[str, jax.Array]) -> jax.Array:
+        value: jax.Array = family.psi(*jnp.asarray(arguments), **varied, **fixed)
+        return value
+
+    return {key: np.asarray(value) for key, value in jax.grad(psi)(inexact).items()}
+
+
+@dataclass(frozen=True)
+class _Slackened:
+    """ψ + slack."""
+
+    psi: Callable[..., Any]
+
+    def __call__(self, *positions: Any, slack: Any, **parameters: Any) -> Any:
+        return self.psi(*positions, **parameters) + slack
+
+
+def turned(team: Team, knob: _Knob, amount: float) -> Team:
+    """The team with one constraint relaxed."""
+    families = []
+    for family in team.families:
+        here = family.number == knob.constraint
+        if not here.any():
+            families.append(family)
+        elif knob.parameter:
+            changed = family.parameters[knob.parameter].copy()
+            changed[(int(np.argmax(here)), *knob.entry)] += knob.sign * amount
+            families.append(dataclasses.replace(family, parameters={**family.parameters, knob.parameter: changed}))
+        else:
+            single = _members(family, here)
+            slack = {**single.parameters, "slack": np.full(1, amount)}
+            families.append(dataclasses.replace(single, psi=_Slackened(family.psi), parameters=slack, sources=None))
+            if not here.all():
+                families.append(_members(family, ~here))
+    return team.with_constraints(families, team.owner, team.names)
+
+
+def restricted(team: Team, keep: Bools) -> Team:
+    """The team with only some of its constraints (M,)."""
+    place = np.cumsum(keep) - 1
+    families = []
+    for family in team.families:
+        members = keep[family.number]
+        if members.any():
+            kept = _members(family, members)
+            families.append(dataclasses.replace(kept, number=place[kept.number].astype(np.int32)))
+    names = [team.names[k] for k in np.flatnonzero(keep).tolist()]
+    return team.with_constraints(families, team.owner[keep], names)
+
+
+def _members(family: Family, members: Bools) -> Family:
+    sources = None if family.sources is None else [family.sources[m] for m in np.flatnonzero(members).tolist()]
+    return dataclasses.replace(
+        family, agents=family.agents[members], owner=family.owner[members], number=family.number[members], weight=family.weight[members],
+        parameters={key: value[members] for key, value in family.parameters.items()}, sources=sources,
+    )  # fmt: skip
+
+
+def _proposal(team: Team, knob: _Knob, amount: float) -> str:
+    label = _label(team, knob.constraint)
+    if not knob.parameter:
+        return f"Letting ψ of {label} fall short of 0 by {_number(amount)} would do."
+    verb = "Raising" if knob.sign > 0 else "Lowering"
+    what = knob.parameter if not knob.entry else f"{knob.parameter}[{knob.entry[0]}]"
+    after = knob.now + knob.sign * amount
+    digits = 4 if not after else max(4, math.ceil(math.log10(abs(after) / amount)) + DIGITS)
+    return f"{verb} the {what} of {label} by {_number(amount)}, from {_number(knob.now, digits)} to {_number(after, digits)}, would do."
+
+
+def _listed(team: Team, constraints: list[int]) -> str:
+    labels = [_label(team, k) for k in constraints[:NAMED]]
+    if len(constraints) > NAMED:
+        labels.append(f"{len(constraints) - NAMED} more")
+    return " and ".join([", ".join(labels[:-1]), labels[-1]]) if len(labels) > 1 else "".join(labels)
+
+
+def _label(team: Team, constraint: int) -> str:
+    """``a2's tether to a3``, or ``a2's near(a3)`` where the name says it already."""
+    owner, name = int(team.owner[constraint]), team.names[constraint]
+    for family in team.families:
+        for member in np.flatnonzero(family.number == constraint):
+            others = [team.ids[i] for i in family.agents[member].tolist() if i != owner]
+            if others and not name.startswith(f"{family.kind}("):
+                return f"{team.ids[owner]}'s {name} to {', '.join(others)}"
+    return f"{team.ids[owner]}'s {name}"
+
+
+def _number(value: float, digits: int = 4) -> str:
+    return f"{value:.{digits}g}".replace("-", "−")

@@ -1,0 +1,175 @@
+"""How a team could move off for ever without loss: the exact test behind bounded level sets and a unique optimum (design, section 7).
+
+For ψ_k = c_k + b_k·y + ½ yᵀH_k y, going along d for ever makes no ψ_k worse iff d is in
+
+    {d : H_k d = 0 and b_k·d ≥ 0 for all k}.
+
+H d = 0 is first used to merge coordinates: an agent with a ψ that is curved every way in its own position stays, two that a curved ψ of
+their difference ties go together. What is left is small as a rule, and a chain of ten thousand agents, whose smallest eigenvalue drowns in
+rounding, is as clear as one of two. The rest is a rank and a linear program.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.optimize import linprog
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from consat.certify.quadratics import Bools, Expansion, Floats, Ints
+
+FLAT = 1e-10
+"""A direction along which every ψ changes by less than this part of its own size is one that leaves it as it is. Ill-posed in between:
+whoever writes two walls that are parallel to ten digits is told that they are."""
+NULL = 1e-13
+"""An eigenvalue of a sum of squares below this part of the largest is zero; a chain of a million links still has 2e-12."""
+MOST_DENSE = 500
+"""Up to so many merged coordinates the rank is found by eigenvalues, above by inverse iteration."""
+MOST_PROGRAMMED = 200_000
+"""Up to so many merged coordinates the linear program is solved; beyond, nothing is said."""
+
+
+class Recession(NamedTuple):
+    """How a team can move without any ψ getting worse, in the end.
+
+    Attributes:
+        bounded: whether it cannot; None if unknown.
+        invariant: whether there is a way that leaves every ψ as it is; None if unknown.
+        adrift: (N,) agents that such a way moves.
+    """
+
+    bounded: bool | None
+    invariant: bool | None
+    adrift: Bools
+
+
+def recession(model: Expansion, read: Bools) -> Recession:
+    """The exact test.
+
+    Args:
+        model: constraints of degree ≤ 2.
+        read: (N,) the agents that matter, whether or not a constraint of the model reads them.
+    """
+    agents, dimension = model.at.shape
+    group, curved = _merged(model)
+    count = int(group.max(initial=-1)) + 1
+    onto = _onto(group, dimension)
+    slopes = (_unit_slopes(model) @ onto).tocsr()
+    slopes.data[np.abs(slopes.data) < FLAT] = 0.0
+    slopes.eliminate_zeros()
+    flat = sparse.vstack([(part @ onto).tocsr() for part in curved] or [sparse.csr_array((0, count * dimension))]).tocsr()
+    alive = np.zeros(count, dtype=bool)
+    alive[group[read & (group >= 0)]] = True
+    keep = np.repeat(alive, dimension)
+    slopes, flat = slopes[:, keep], flat[:, keep]
+    slopes = slopes[np.diff(slopes.indptr) > 0]
+    direction = _null(sparse.vstack([flat, slopes]).tocsr())
+    invariant = direction is not None
+    if direction is None:
+        if slopes.shape[1] > MOST_PROGRAMMED:
+            return Recession(None, False, np.zeros(agents, dtype=bool))
+        direction = _improving(slopes, flat)
+    if direction is None:
+        return Recession(True, False, np.zeros(agents, dtype=bool))
+    moved = np.zeros((count, dimension))
+    moved[alive] = direction.reshape(-1, dimension)
+    moves = np.abs(moved).max(axis=1, initial=0.0) > 1e-6
+    return Recession(False, invariant, np.where(group >= 0, moves[group], False) if count else np.zeros(agents, dtype=bool))
+
+
+def _merged(model: Expansion) -> tuple[Ints, list[sparse.csr_array]]:
+    """(N,) groups of agents that H d = 0 moves together, −1 for those that it holds in place; and what is left of H, as rows."""
+    agents, dimension = model.at.shape
+    held, pairs, left = np.zeros(agents, dtype=bool), [np.zeros((0, 2), dtype=np.intp)], []
+    for block in model.blocks:
+        who, n = block.columns[:, ::dimension] // dimension, block.columns.shape[1]
+        sizes = np.abs(block.hessian).max(axis=(1, 2))
+        whole = _nonsingular(block.hessian)
+        held[who[whole]] = True
+        rest = ~whole & (sizes > 0)
+        if n == 2 * dimension:
+            across = np.abs(block.hessian[:, :, :dimension] + block.hessian[:, :, dimension:]).max(axis=(1, 2))
+            tied = rest & (across <= FLAT * sizes) & _nonsingular(block.hessian[:, :dimension, :dimension])
+            pairs.append(who[tied])
+            rest &= ~tied
+        if rest.any():
+            rows = (block.hessian[rest] / sizes[rest, None, None]).reshape(-1, n)
+            columns = np.repeat(block.columns[rest], n, axis=0)
+            start = np.arange(len(rows) + 1) * n
+            left.append(sparse.csr_array((rows.ravel(), columns.ravel(), start), shape=(len(rows), model.size)))
+    edges = np.concatenate(pairs)
+    graph = sparse.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(agents, agents))
+    label = connected_components(graph, directed=False)[1]
+    free = np.ones(int(label.max(initial=-1)) + 1, dtype=bool)
+    free[label[held]] = False
+    number = np.where(free, np.cumsum(free) - 1, -1)
+    return number[label], left
+
+
+def _nonsingular(hessian: Floats) -> Bools:
+    eigenvalues = np.abs(np.linalg.eigvalsh(hessian))
+    return (eigenvalues.min(axis=1) > FLAT * eigenvalues.max(axis=1)) & (eigenvalues.max(axis=1) > 0)
+
+
+def _onto(group: Ints, dimension: int) -> sparse.csr_array:
+    """(N·d, G·d) from the coordinates of groups to those of their agents."""
+    agents = np.flatnonzero(group >= 0)
+    axes = np.arange(dimension)
+    rows, columns = (np.add.outer(part * dimension, axes).ravel() for part in (agents, group[agents]))
+    shape = (len(group) * dimension, (int(group.max(initial=-1)) + 1) * dimension)
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+
+
+def _unit_slopes(model: Expansion) -> sparse.csr_array:
+    """Rows b_k in units of the larger of ‖b_k‖ and ‖H_k‖ times the spread of the formation: what is small beside these is rounding."""
+    slopes, size = model.jacobian(), np.zeros(len(model.value))
+    spread = float(np.abs(model.at - model.at.mean(axis=0)).max(initial=0.0))
+    for block in model.blocks:
+        bend = np.abs(block.hessian).max(axis=(1, 2), initial=0.0) * max(spread, np.finfo(float).tiny)
+        size[block.number] = np.maximum(np.abs(block.gradient).max(axis=1), bend)
+    scaled: sparse.csr_array = (sparse.diags_array(1.0 / np.where(size > 0, size, 1.0)) @ slopes).tocsr()
+    return scaled
+
+
+def _null(matrix: sparse.csr_array) -> Floats | None:
+    """A vector of length 1 (largest entry) that the matrix maps to 0, or None."""
+    columns = matrix.shape[1]
+    if not columns:
+        return None
+    if columns <= MOST_DENSE:
+        square = (matrix.T @ matrix).toarray()
+        size, vectors = np.linalg.eigh(square)
+        smallest, largest = size[0], size[-1]
+        space = vectors[:, size <= NULL * max(largest, 1.0)]
+        direction = space @ np.random.default_rng(0).normal(size=space.shape[1])  # a mixture, which moves whoever can move
+    else:
+        square = (matrix.T @ matrix).tocsc()
+        largest = float(sparse.linalg.norm(square, np.inf)) or 1.0
+        factor = splu((square + 1e-14 * largest * sparse.eye_array(columns)).tocsc(), permc_spec="MMD_AT_PLUS_A")
+        direction = np.random.default_rng(0).normal(size=columns)
+        for _ in range(8):
+            direction = factor.solve(direction)
+            direction /= np.linalg.norm(direction)
+        smallest = float(direction @ (square @ direction))
+    if smallest > NULL * max(largest, 1.0):
+        return None
+    return np.asarray(direction / np.abs(direction).max(), dtype=float)
+
+
+def _improving(slopes: sparse.csr_array, flat: sparse.csr_array) -> Floats | None:
+    """d with slopes d ≥ 0, not all 0, and flat d = 0; or None. A linear program over the unit box."""
+    columns = slopes.shape[1]
+    if not columns:
+        return None
+    gain = np.asarray(slopes.sum(axis=0)).ravel()
+    answer = linprog(
+        -gain, A_ub=-slopes, b_ub=np.zeros(slopes.shape[0]), A_eq=flat if flat.shape[0] else None,
+        b_eq=np.zeros(flat.shape[0]) if flat.shape[0] else None, bounds=(-1.0, 1.0), method="highs",
+    )  # fmt: skip
+    if answer.status != 0 or -answer.fun < 1e-6:
+        return None
+    direction: Floats = answer.x
+    return direction

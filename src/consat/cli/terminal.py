@@ -1,0 +1,53 @@
+"""What the commands of `consat.cli.main` and of `consat.network` have in common: arguments, exit codes, and how a run is told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from consat.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from consat.results.result import Result
+    from consat.scenario import Scenario
+
+DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+scenario_argument = click.argument("scenario", metavar="FILE")
+set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
+estimates_option = click.option(
+    "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."
+)
+out_option = click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there."
+)
+force_option = click.option("--force", is_flag=True, help="Overwrite results of another scenario in --out.")
+full_option = click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
+
+
+@contextmanager
+def located(scenario: Scenario | None) -> Iterator[None]:
+    """Faults that show only later, such as a cluster without links, get their place in the file."""
+    from consat.scenario import located as in_file
+
+    try:
+        yield
+    except InvalidInput as error:
+        raise error if scenario is None else in_file(error, scenario) from None
+
+
+def tell(result: Result, *, quiet: bool, as_json: bool) -> int:
+    """Print what came out; gives the exit code."""
+    if as_json:
+        click.echo(json.dumps(result.summary))
+    elif not quiet:
+        click.echo(str(result))
+    if result.summary["ending"] == "interrupted":
+        return INTERRUPTED
+    return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)

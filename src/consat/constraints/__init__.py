@@ -1,9 +1,0 @@
-"""What a constraint is: the record, the library kinds, and safe text expressions."""
-
-from consat.constraints.library import KINDS, apart, box, constraint, displacement, expr, halfspace, near, outside, within
-from consat.constraints.record import OWNER, Constraint, Fixed, Number, Vector
-
-__all__ = [
-    "KINDS", "OWNER", "Constraint", "Fixed", "Number", "Vector",
-    "apart", "box", "constraint", "displacement", "expr", "halfspace", "near", "outside", "within",
-]  # fmt: skip

@@ -1,0 +1,244 @@
+"""Many runs in rounds as one computation: a pool of lanes, each a run of its own, in which the next run takes the place of one that ended.
+
+A lane ends at the very round at which the same run would end by itself: lanes that have ended wait, frozen, for the rest of a chunk of
+rounds, and then give their place away, so that no run waits for the slowest one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.engine.chunks import CHUNK, NEVER, Ask, Chosen, Chunk, advance, start
+from consat.engine.round import Now, World
+from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally
+from consat.numerics import float64, quick_compilation
+from consat.protocols import Rounds
+from consat.results.trace import Ending
+
+LANES = 32
+"""The most lanes of a pool, …"""
+NUMBERS = 2**17
+"""… of which all estimates together should be no more numbers than stay in a cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What many runs share but for starts and luck.
+
+    Attributes:
+        world: what does not change in a run.
+        gains: fields of the protocol that differ between cases.
+        rules: when a run ends.
+    """
+
+    world: World
+    gains: Mapping[str, float]
+    rules: Rules
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """One run.
+
+    Attributes:
+        case: what is run.
+        first: (C, d) first estimates.
+        seed: of what goes wrong.
+    """
+
+    case: Case
+    first: np.ndarray
+    seed: int
+
+
+class Outcome(NamedTuple):
+    """What became of a run: counts, everyone's last positions (N, d), and why it ended."""
+
+    tally: Tally
+    positions: np.ndarray
+    ending: Ending
+
+
+def like(case: Case) -> Hashable:
+    """Cases of which this is equal run as one computation."""
+    leaves, structure = jax.tree.flatten(case.world)
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(case.gains), case.rules.stop
+
+
+@float64
+def simulate_batch(protocol: Rounds, lanes: Sequence[Lane], progress: Callable[[float, float], None] = lambda *_: None) -> list[Outcome]:
+    """Run lanes whose cases are alike.
+
+    Args:
+        protocol: of all.
+        lanes: in any order.
+        progress: called with the fraction of the runs that have ended, and the share of these that ended satisfied.
+
+    Returns:
+        the outcomes, in the same order.
+    """
+    cases = list({id(lane.case): lane.case for lane in lanes}.values())
+    shared = _Shared.of(protocol, cases)
+    number = {id(case): k for k, case in enumerate(cases)}
+    of_lane = np.array([number[id(lane.case)] for lane in lanes])
+    size = 1 << max(0, min(LANES, NUMBERS // max(lanes[0].first.size, 1), len(lanes)) - 1).bit_length()
+    pool = _Pool(shared, lanes, of_lane, size)
+    satisfied = 0
+    while pool.waiting or pool.running:
+        pool.fill()
+        for lane in pool.advance():
+            pool.outcomes[lane] = pool.outcome(lane)
+            satisfied += pool.outcomes[lane].tally.margin > 0
+        progress(len(pool.outcomes) / len(lanes), satisfied / max(len(pool.outcomes), 1))
+    return [pool.outcomes[k] for k in range(len(lanes))]
+
+
+class _Varied(NamedTuple):
+    """What of a world, and of the gains, differs between cases: arrays with the cases, or the lanes, along their first axis."""
+
+    leaves: tuple[Array, ...]
+    gains: Mapping[str, Array]
+
+
+class _Plan(NamedTuple):
+    """What a computation is compiled for: the protocol, the structure of the worlds, and which of their leaves differ."""
+
+    protocol: Rounds
+    structure: Any
+    places: tuple[int, ...]
+
+    def merged(self, fixed: Sequence[Array], varied: _Varied) -> tuple[Rounds, World]:
+        """Protocol and world of one lane."""
+        left, given = iter(fixed), dict(zip(self.places, varied.leaves, strict=True))
+        world = jax.tree.unflatten(self.structure, [given[k] if k in given else next(left) for k in range(self.structure.num_leaves)])
+        protocol: Any = self.protocol
+        return (dataclasses.replace(protocol, **varied.gains) if varied.gains else protocol), world
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """Cases that are alike.
+
+    Attributes:
+        plan: what they are compiled as.
+        fixed: the leaves of a world that do not differ.
+        varied: those that do, stacked.
+    """
+
+    plan: _Plan
+    fixed: tuple[Array, ...]
+    varied: _Varied
+
+    @classmethod
+    def of(cls, protocol: Rounds, cases: Sequence[Case]) -> _Shared:
+        structure = jax.tree.structure(cases[0].world)
+        columns = [[np.asarray(leaf) for leaf in column] for column in zip(*(jax.tree.leaves(case.world) for case in cases), strict=True)]
+        places = tuple(k for k, column in enumerate(columns) if any(not np.array_equal(leaf, column[0]) for leaf in column[1:]))
+        gains = {name: jnp.asarray([case.gains[name] for case in cases], dtype=float) for name in cases[0].gains}
+        return cls(
+            _Plan(protocol, structure, places),
+            tuple(jnp.asarray(column[0]) for k, column in enumerate(columns) if k not in places),
+            _Varied(tuple(jnp.asarray(np.stack(columns[k])) for k in places), gains),
+        )
+
+
+class _Pool:
+    """The lanes that run now; a place of the pool that nobody needs any more holds a lane that does nothing."""
+
+    def __init__(self, shared: _Shared, lanes: Sequence[Lane], of_lane: np.ndarray, size: int) -> None:
+        self._shared, self._lanes, self._of_lane, self._size = shared, lanes, of_lane, size
+        self.waiting = list(range(len(lanes)))[::-1]
+        self.running: dict[int, int] = {}
+        self.tallies: dict[int, Tally] = {}
+        self.endings: dict[int, Ending] = {}
+        self.outcomes: dict[int, Outcome] = {}
+        self._lane_at = np.zeros(size, dtype=int)
+        self._state: Now | None = None
+        self._varied: _Varied | None = None
+        self._positions: np.ndarray | None = None
+
+    def fill(self) -> None:
+        """Let waiting lanes start where there is place."""
+        places = [place for place in range(self._size) if place not in self.running][: len(self.waiting)]
+        if not places:
+            return
+        fresh = np.zeros(self._size, dtype=bool)
+        fresh[places] = True
+        for place in places:
+            self.running[place] = self._lane_at[place] = self.waiting.pop()
+        first = np.stack([self._lanes[lane].first for lane in self._lane_at])
+        keys = jax.vmap(jax.random.key)(jnp.asarray([self._lanes[lane].seed for lane in self._lane_at]))
+        self._varied = jax.tree.map(lambda leaf: leaf[self._of_lane[self._lane_at]], self._shared.varied)
+        begin, _, choose = _compiled()
+        now, chunk = begin(self._shared.plan, self._shared.fixed, self._varied, jnp.asarray(first), keys)
+        self._state = now if self._state is None else choose(jnp.asarray(fresh), now, self._state)
+        chunk = jax.tree.map(np.asarray, chunk)
+        for place in places:
+            tally = self.tallies[self.running[place]] = Tally()
+            tally.add(_row(chunk, place))
+
+    def advance(self) -> list[int]:
+        """A chunk of rounds of every lane; gives the lanes that have ended."""
+        number, rounds, streak, hold, most, near, knowing = (np.zeros(self._size, dtype=np.int64) for _ in range(7))
+        for place, lane in self.running.items():
+            tally, rules = self.tallies[lane], self._lanes[lane].case.rules
+            number[place], streak[place], near[place] = tally.done, tally.streak, tally.near
+            rounds[place] = min(CHUNK, rules.end - tally.done)
+            hold[place], most[place] = (HOLD, rules.most) if rules.stop == "satisfied" else (NEVER, NEVER)
+            knowing[place] = ENOUGH[rules.stop]
+        ask = Ask(*(jnp.asarray(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
+        self._state, chunk = _compiled()[1](self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
+        chunk, self._positions = jax.tree.map(np.asarray, (chunk, self._state.body))
+        ended = []
+        for place, lane in list(self.running.items()):
+            tally, rules = self.tallies[lane], self._lanes[lane].case.rules
+            if rounds[place]:
+                tally.add(_row(chunk, place))
+            found = rules.ending(tally, functools.partial(self._positions.__getitem__, place))
+            if found is not None or tally.done >= rules.end:
+                self.endings[lane] = found or "out of time"
+                ended.append(lane)
+        return ended
+
+    def outcome(self, lane: int) -> Outcome:
+        """Of a lane that has ended; its place is free."""
+        place = next(place for place, other in self.running.items() if other == lane)
+        del self.running[place]
+        assert self._positions is not None
+        return Outcome(self.tallies[lane], self._positions[place].copy(), self.endings[lane])
+
+
+def _row(chunk: Chunk, place: int) -> Chunk:
+    scalars = {name: leaf[place] for name, leaf in chunk._asdict().items() if name != "kept"}
+    return Chunk(**scalars, kept=chunk.kept)
+
+
+@functools.cache
+def _compiled() -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    def nobody() -> Chosen:
+        return Chosen(*(jnp.zeros(0, jnp.int32) for _ in range(3)))
+
+    def begin(plan: _Plan, fixed: Any, varied: _Varied, first: Array, keys: Array) -> Any:
+        return jax.vmap(lambda varied, first, key: start(*plan.merged(fixed, varied), nobody(), first, key))(varied, first, keys)
+
+    def go_on(plan: _Plan, fixed: Any, varied: _Varied, now: Now, ask: Ask) -> Any:
+        return jax.vmap(lambda varied, now, ask: advance(*plan.merged(fixed, varied), nobody(), 1, now, ask))(varied, now, ask)
+
+    def choose(fresh: Array, new: Now, old: Now) -> Now:
+        return jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+
+    options = quick_compilation()
+    return (
+        jax.jit(begin, static_argnames=("plan",), compiler_options=options),
+        jax.jit(go_on, static_argnames=("plan",), compiler_options=options),
+        jax.jit(choose, compiler_options=options),
+    )

@@ -1,0 +1,157 @@
+"""The state of a run on disk, so that it can be taken up again bit for bit; plain arrays by name, never pickled."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import time
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from consat.errors import InvalidResult
+from consat.problem.team import Team
+
+SCHEMA = "consat.checkpoint/1"
+NAME = "checkpoint.npz"
+SHARE = 0.05
+"""Of the time of a run, that writing checkpoints may take at most."""
+_META = "meta"
+
+
+@dataclasses.dataclass
+class Checkpoint:
+    """Where and how often to write one.
+
+    Attributes:
+        path: of the file.
+        seconds: between two, at least.
+        about: what else must be known to go on; plain data.
+        taken_up: what an earlier run left, or None.
+    """
+
+    path: Path
+    seconds: float
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    taken_up: tuple[Mapping[str, np.ndarray], Mapping[str, Any]] | None = None
+    _next: float = dataclasses.field(default_factory=time.monotonic)
+
+    def due(self) -> bool:
+        """Whether the last one has become old."""
+        return time.monotonic() >= self._next
+
+    def write(self, state: Any, tally: Mapping[str, Any], problem: str) -> None:
+        """Replace the last one, at once or not at all.
+
+        Args:
+            state: a pytree of arrays.
+            tally: counts, as plain data and arrays.
+            problem: `fingerprint` of what is run.
+        """
+        began = time.monotonic()
+        arrays = {name: np.asarray(_plain(leaf)) for name, leaf in _named(state).items()}
+        meta = json.dumps({"schema": SCHEMA, "problem": problem, "tally": dict(tally), **self.about}, default=np.ndarray.tolist)
+        part = self.path.with_name(self.path.name + ".part")
+        with part.open("wb") as file:
+            np.savez(file, allow_pickle=False, **{_META: np.frombuffer(meta.encode(), dtype=np.uint8)}, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(self.path)
+        now = time.monotonic()
+        self._next = now + max(self.seconds, (now - began) / SHARE)
+
+    def restore(self, like: Any, problem: str) -> tuple[Any, Mapping[str, Any]] | None:
+        """The state and the tally of the run that is taken up, or None if none is.
+
+        Args:
+            like: a pytree of the same structure, shapes and types.
+            problem: `fingerprint` of what is run.
+
+        Raises:
+            InvalidResult: the checkpoint is of another problem.
+        """
+        if self.taken_up is None:
+            return None
+        arrays, meta = self.taken_up
+        if meta["problem"] != problem:
+            raise InvalidResult(f"{self.path}: this is the state of another team, protocol or setting; go on with the one that was stopped")
+        leaves = []
+        for name, leaf in _named(like).items():
+            value, wanted = arrays.get(name), _plain(leaf)
+            if value is None or value.shape != wanted.shape or value.dtype != wanted.dtype:
+                raise InvalidResult(f"{self.path}: {name} is missing or of another kind; it was written by another version of consat")
+            array = jnp.asarray(value)
+            leaves.append(jax.random.wrap_key_data(array) if _is_key(leaf) else array)
+        return jax.tree.unflatten(jax.tree.structure(like), leaves), meta["tally"]
+
+
+def read(path: Path) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
+    """The arrays of a checkpoint, and what else it holds.
+
+    Raises:
+        InvalidResult: there is none, or it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(arrays.pop(_META).tobytes())
+        schema = meta["schema"]
+    except FileNotFoundError:
+        raise InvalidResult(f"{path}: there is no checkpoint; `consat run FILE --out DIR --checkpoint` writes one") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidResult(f"{path}: this is no checkpoint of consat ({error})") from error
+    if schema != SCHEMA:
+        raise InvalidResult(f"{path}: this is a {schema!r}, but this version of consat reads {SCHEMA!r}")
+    return arrays, meta
+
+
+def scenario(path: Path) -> str | None:
+    """The name of the scenario whose checkpoint it is, None if it does not say; errors as of `read`, or of what is no checkpoint."""
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        name: str | None = json.loads(file[_META].tobytes()).get("scenario_name")
+    return name
+
+
+def fingerprint(team: Team, *parts: Any) -> str:
+    """A hash of the team's numbers and of everything else that decides what a run does.
+
+    Args:
+        team: the team.
+        parts: arrays, and whatever has a telling `repr`.
+    """
+    digest = hashlib.sha256()
+
+    def add(part: Any) -> None:
+        if isinstance(part, np.ndarray | jax.Array):
+            digest.update(f"{part.dtype}{part.shape}".encode())
+            digest.update(np.asarray(part).tobytes())
+        else:
+            digest.update(repr(part).encode())
+
+    for part in (team.dimension, team.count, team.links, *parts):
+        add(part)
+    for family in team.families:
+        add((family.kind, family.arity, family.sources))
+        for array in (family.agents, family.owner, family.weight, *(family.parameters[key] for key in sorted(family.parameters))):
+            add(array)
+    return digest.hexdigest()
+
+
+def _named(state: Any) -> dict[str, Any]:
+    return {"state" + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
+
+
+def _is_key(leaf: Any) -> bool:
+    return bool(jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
+
+
+def _plain(leaf: Any) -> Any:
+    """The numbers of a leaf; of a random key its data."""
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf

@@ -1,0 +1,462 @@
+"""One round, for all agents at once: everybody speaks, the messages travel (or don't), everybody hears."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.numerics import Groups, pick
+from consat.problem.family import distinct
+from consat.problem.graphs import hops
+from consat.problem.objective import Nu, Objective
+from consat.problem.team import Team
+from consat.problem.units import Region, Scale
+from consat.protocols import InteriorPoint, Known, Rounds, agreement
+from consat.protocols.estimates import Estimates
+from consat.protocols.interior_point import EXACTLY, near
+from consat.protocols.local import proximal as prox
+from consat.protocols.local.interior import Interior
+from consat.protocols.solver import EXACT, LocalSolver
+
+QUICK = prox.Precision(tolerance=None)
+"""Of every local step of a large team: there the arithmetic counts, and an exact step saves no rounds. Each begins where the last ended, so
+that the steps become exact as the team comes to rest."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ends:
+    """Both ends of every link of every copy: `consat.protocols.Links` of all agents at once.
+
+    Attributes:
+        other: (B,) the index of the same link's other end, in blocks of copies; see `consat.protocols.estimates.Estimates.ends`.
+        groups: groups the ends by copy, in blocks.
+        degree: (C,).
+        metropolis: (E,).
+        block: copies in a block.
+    """
+
+    other: Array
+    groups: Groups
+    degree: Array
+    metropolis: Array
+    block: int = field(metadata={"static": True})
+
+    @classmethod
+    def of(cls, receiver: np.ndarray, sender: np.ndarray, block: int, copies: int) -> Ends:
+        """Args: receiver, sender, block: see `consat.protocols.estimates.Estimates.ends`; copies: C."""
+        here, there, count = receiver.astype(np.int64), sender.astype(np.int64), copies // block
+        other = np.searchsorted(here * count + there, there * count + here)
+        degree = np.bincount(receiver, minlength=count)
+        metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
+        return cls(
+            jnp.asarray(other.astype(np.int32)),
+            Groups.of(receiver, count),
+            jnp.asarray(np.repeat(degree.astype(float), block)),
+            jnp.asarray(np.repeat(metropolis, block)),
+            block,
+        )
+
+    def __len__(self) -> int:
+        return len(self.metropolis)
+
+    def at(self, rows: Array) -> Array:
+        return self._in_blocks(self.groups.spread, rows)
+
+    def sum(self, links: Array) -> Array:
+        return self._in_blocks(self.groups.sum, links)
+
+    def least(self, links: Array) -> Array:
+        return -self._in_blocks(self.groups.max, -links)
+
+    def across(self, links: Array) -> Array:
+        """(E, …) → (E, …): what stands at the other ends."""
+        return self._in_blocks(lambda blocks: pick(blocks, self.other), links)
+
+    def _in_blocks(self, function: Callable[[Array], Array], values: Array) -> Array:
+        if self.block == 1:
+            return function(values)
+        found = function(values.reshape(-1, self.block, *values.shape[1:]))
+        return found.reshape(-1, *found.shape[2:])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Everyone(LocalSolver):
+    """All agents at once.
+
+    Attributes:
+        links: all ends.
+        agents: N.
+    """
+
+    links: Ends
+    agents: int = field(metadata={"static": True})
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What goes wrong on the way, seeded.
+
+    Attributes:
+        loss: probability that a message between two agents is lost, each direction by itself.
+        sleep: probability that an agent skips a round: it computes and sends nothing, but hears.
+        seed: of the draws.
+    """
+
+    loss: float = 0.0
+    sleep: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body cannot jump: p ← p + clip(x − p) to at most speed/rate a round.
+
+    Attributes:
+        rate: rounds a second, Hz.
+        speed: the most that a body moves, length/s; if infinite it is where its agent wants to be.
+    """
+
+    rate: float
+    speed: float = np.inf
+
+    @property
+    def reach(self) -> float | None:
+        """The most that it moves in a round; None without limit."""
+        return self.speed / self.rate if np.isfinite(self.speed) else None
+
+
+class Seen(NamedTuple):
+    """What an observer of the whole team sees after each round; leading axis T."""
+
+    position: Any
+    margin: Any
+    smooth_margin: Any
+    agent_margin: Any
+    estimate: Any
+    known: Any
+    bound: Any
+    messages: Any
+    floats: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Part:
+    """How the agents of a process stand in the whole team. They come first; behind them the neighbours of other processes.
+
+    Attributes:
+        agent: (n,) numbers in the team.
+        pair: numbers of the pairs.
+        ours: (n,) whose agents they are: this process's.
+        agents: N of the team.
+        pairs: of the team.
+    """
+
+    agent: Array
+    pair: Array
+    ours: Array
+    agents: int = field(metadata={"static": True})
+    pairs: int = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class World:
+    """Everything a round needs that does not change.
+
+    Attributes:
+        everyone: the agents.
+        observer: of their true positions.
+        own: (N,) rows of own positions.
+        talker: (E,) who speaks at each end.
+        pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
+        reach: most that a body moves in a round; None if it can jump.
+        owners: see `consat.protocols.agreement`; None where bodies can jump and agents go by their estimates of one another.
+        loss: see `Weather`.
+        sleep: see `Weather`.
+        pairs: how many directed pairs.
+        rough: whether messages can be lost or agents sleep.
+        part: of which larger team this is a part; None of none.
+    """
+
+    everyone: Everyone
+    observer: Objective
+    own: Array
+    talker: Array
+    pair: Array
+    reach: Array | None
+    owners: agreement.Owners | None
+    loss: Array
+    sleep: Array
+    pairs: int = field(metadata={"static": True})
+    rough: bool = field(metadata={"static": True})
+    part: Part | None = None
+
+
+class Now(NamedTuple):
+    """Everything a round changes: what the agents remember, where their bodies are, and the key of what goes wrong.
+
+    Attributes:
+        state: of the protocol.
+        ages: of `consat.protocols.agreement`.
+        body: (N, d).
+        key: of the random draws.
+        heard: what they know of each other's bodies; None where bodies can jump.
+    """
+
+    state: Any
+    ages: agreement.Ages
+    body: Array
+    key: Array
+    heard: agreement.Bodies | None = None
+
+
+class Spoken(NamedTuple):
+    """Between speaking and hearing.
+
+    Attributes:
+        state: of the protocol, after its step.
+        ages: likewise.
+        body: (N, d) likewise.
+        heard: likewise.
+        crossing: what stands at each end, on its way to the other: the protocol's message, the ages, (E,), and word of bodies, if any.
+        went: (E,) whether it was sent and not lost; None where nothing is.
+        reached: (P,) the same of the message to each neighbour; None where nobody asks.
+        key: of the random draws that follow.
+        messages: sent.
+        floats: sent.
+    """
+
+    state: Any
+    ages: agreement.Ages
+    body: Array
+    heard: agreement.Bodies | None
+    crossing: tuple[Any, Array, agreement.Word | None]
+    went: Array | None
+    reached: Array | None
+    key: Array
+    messages: Array
+    floats: Array
+
+
+def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
+    """What all agents do in one round."""
+    spoken = speak(protocol, world, now, round_)
+    now, known = hear(protocol, world, spoken)
+    return now, see(world, now.state.x, now.body, known, (spoken.messages, spoken.floats))
+
+
+def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
+    """The first half of a round."""
+    everyone, ends = world.everyone, world.everyone.links
+    at = now.state.x if now.heard is None else now.heard.position
+    known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
+    state, message = protocol.speak(now.state, everyone, round_, known)
+    ages, told = agreement.speak(now.ages, state.x, everyone)
+    key, went, awake, reached = now.key, None, None, None
+    sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
+    counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
+    if world.rough:
+        key, awake, through = _luck(world, now.key)
+        state = _where_awake(protocol.per, world, awake, state, now.state)
+        ages = _where_awake(_AGES, world, awake, ages, now.ages)
+        goes = awake[world.talker]
+        went, reached = goes & through[world.pair], through
+        counted = goes if counted is None else goes & counted
+    if counted is not None:
+        sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
+        copies_sent = jnp.sum(counted)
+    body = _moved(now.body, pick(state.x, world.own), world.reach)
+    heard, word = now.heard, None
+    if now.heard is not None and world.owners is not None:
+        heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
+        if awake is not None:
+            heard = _where_awake(_BODIES, world, awake, heard, now.heard)
+    per_copy = jax.tree.leaves((message if protocol.speaks == "link" else (), () if word is None else (word.position, word.stale)))
+    floats = (sent if word is None else 2 * sent) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
+    if protocol.speaks == "pair" and everyone.interior is not None:
+        talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
+        reached = talks if reached is None else talks & reached
+        floats += jnp.sum(jnp.where(talks, everyone.interior.plan.floats, 0))
+    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats)
+
+
+_AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
+_BODIES: Mapping[str, Any] = {"position": "row", "stale": "row", "ages": _AGES}
+
+
+def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
+    """The next key, (N,) who is awake, and (pairs,) between whom messages get through."""
+    key, draw_loss, draw_sleep = jax.random.split(key, 3)
+    part = world.part
+    if part is None:
+        awake, through = jax.random.uniform(draw_sleep, (world.everyone.agents,)), jax.random.uniform(draw_loss, (world.pairs,))
+    else:  # the same as in one process
+        awake = jax.random.uniform(draw_sleep, (part.agents,))[part.agent]
+        through = jax.random.uniform(draw_loss, (part.pairs,))[part.pair]
+    return key, awake >= world.sleep, through >= world.loss
+
+
+def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Array, Array]]:
+    """The second half of a round; tells also what all know, see `knowledge`."""
+    everyone, ends = world.everyone, world.everyone.links
+    arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
+    message, told, word = spoken.crossing
+    told, word = jax.tree.map(ends.across, (told, word))
+    if protocol.speaks == "pair" and everyone.interior is not None and spoken.reached is not None:
+        interior = everyone.interior
+        state = protocol.hear(spoken.state, interior.across(message), pick(spoken.reached, interior.other), everyone)
+    else:
+        state = protocol.hear(spoken.state, jax.tree.map(ends.across, message), arrived, everyone)
+    ages, heard = agreement.hear(spoken.ages, told, arrived), spoken.heard
+    if heard is not None and word is not None and world.owners is not None:
+        heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
+    known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
+    now = Now(state, ages, spoken.body, spoken.key, heard)
+    return now, knowledge(protocol, world, now, known if world.part is None else known | ~world.part.ours)
+
+
+SATISFIED, INFEASIBLE, NEAR, BEST = 1, 2, 4, 8
+"""What all agents know, as bits: that all are satisfied; that the team cannot be satisfied; and that its margin is proven to be near the
+best, or the best to `EXACTLY`."""
+
+
+def knowledge(protocol: Rounds, world: World, now: Now, satisfied: Array) -> tuple[Array, Array]:
+    """What all agents know, of `SATISFIED` and the others, and the bound on the best margin that all have proven, NaN where none is;
+    `satisfied`: (N,) who knows that all are."""
+    everyone = world.everyone
+    known = jnp.where(jnp.all(satisfied), SATISFIED, 0)
+    if not isinstance(protocol, InteriorPoint) or everyone.interior is None:
+        return known, jnp.asarray(jnp.nan)
+    margin = everyone.margin(now.state.x if now.heard is None else now.heard.position)
+    bound, least = protocol.proven(now.state, everyone, margin)
+    gap, unit = bound - least, everyone.interior.units.psi
+    idle = jnp.isinf(margin) & (everyone.interior.degree == 0)
+    torn = bound < 0
+    proven = jnp.isfinite(bound)
+    best = proven & (gap <= EXACTLY * jnp.maximum(unit, jnp.abs(bound)))
+    some = jnp.any(torn)
+    known += jnp.where(jnp.all(satisfied | torn | idle) & some, INFEASIBLE, 0)
+    known += jnp.where(jnp.all(satisfied | (torn & near(bound, least, unit)) | idle) & some, NEAR, 0)
+    most = jnp.max(jnp.where(idle, -jnp.inf, bound), initial=-jnp.inf)
+    return known + jnp.where(jnp.all(best | idle), BEST, 0), jnp.where(jnp.isfinite(most), most, jnp.nan)
+
+
+def _moved(body: Array, target: Array, reach: Array | None) -> Array:
+    if reach is None:
+        return target
+    away = target - body
+    distance = jnp.linalg.norm(away, axis=1, keepdims=True)
+    return jnp.where(distance > reach, body + away * (reach / jnp.where(distance > 0, distance, 1.0)), target)
+
+
+def see(world: World, x: Array, body: Array, known: tuple[Array, Array], sent: tuple[Array, Array]) -> Seen:
+    """What an observer sees of estimates x and positions `body`; known: see `knowledge`; sent: messages and floats."""
+    margins = world.observer.agent_margins(body)
+    smooth = world.observer.smooth_margin(body, world.everyone.nu)
+    return Seen(body, jnp.min(margins), smooth, margins, x, *known, *sent)
+
+
+def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
+    """The new state of those awake, the old one of those asleep."""
+    masks = {"row": awake[world.everyone.holder], "link": awake[world.talker], "agent": awake}
+    if (interior := world.everyone.interior) is not None:
+        masks |= {"pair": awake[interior.talker], "constraint": awake[interior.owner]}
+
+    def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
+        if isinstance(per, str):
+            return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
+        return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
+
+    return choose(per, new, old)
+
+
+def many_rounds(
+    protocol: Rounds, world: World, now: Now, numbers: Array, look: Callable[[Seen], Any] = lambda seen: seen
+) -> tuple[Now, Any]:
+    """The rounds of these numbers, and of each what `look` keeps, stacked."""
+
+    def step(at: Now, number: Array) -> tuple[Now, Any]:
+        at, seen = one_round(protocol, world, at, number)
+        return at, look(seen)
+
+    return jax.lax.scan(step, now, numbers)
+
+
+def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now, Seen]:
+    """The start from first estimates, (C, d), and what is seen of it."""
+    start = first[world.own]
+    heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
+    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
+    return now, see(world, first, start, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
+
+
+def precision_for(count: int) -> prox.Precision:
+    """Of the local steps of a team of so many agents."""
+    return EXACT if count <= prox.SMALL_TEAM else QUICK
+
+
+def world_of(
+    team: Team,
+    copies: Estimates,
+    nu: Nu,
+    size: Scale,
+    *,
+    convex: bool,
+    weather: Weather,
+    body: Body | None,
+    speaks: str = "link",
+    partial: bool = False,
+) -> World:
+    """Everything that does not change; arguments as in `consat.engine.rounds.simulate_rounds`; speaks: see `consat.protocols.Rounds`;
+    partial: whether it is of one process among several, which must know whose messages to count."""
+    receiver, sender, block = copies.ends()
+    talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
+    everyone = Everyone(
+        links=Ends.of(receiver, sender, block, copies.count),
+        length=jnp.asarray(size.length),
+        region=Region.of(size),
+        plan=prox.buckets(team, copies.rows, copies.count, convex) if speaks == "link" else None,
+        interior=Interior.of(team, copies, size) if speaks == "pair" else None,
+        nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
+        local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
+        holder=jnp.asarray(copies.holder),
+        own=jnp.asarray(copies.own),
+        talkers=Groups.of(talker, team.count),
+        agents=team.count,
+        hops=hops(team.count, copies.links),
+        convex=convex,
+        precision=precision_for(team.count),
+    )
+    rough = weather.loss > 0 or weather.sleep > 0
+    keys = talker.astype(np.int64) * team.count + listener
+    pairs = distinct(keys)
+    if not (rough or partial):  # then nobody asks who is at the ends
+        talker, keys = talker[:0], keys[:0]
+    reach = None if body is None else body.reach
+    return World(
+        everyone=everyone,
+        observer=Objective.at_positions(team),
+        own=jnp.asarray(copies.own),
+        talker=jnp.asarray(talker),
+        pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
+        reach=None if reach is None else jnp.asarray(reach),
+        owners=None if reach is None and speaks == "link" else _owners(copies, receiver, sender, block),
+        loss=jnp.asarray(weather.loss),
+        sleep=jnp.asarray(weather.sleep),
+        pairs=len(pairs),
+        rough=rough,
+    )
+
+
+def _owners(copies: Estimates, receiver: np.ndarray, sender: np.ndarray, block: int) -> agreement.Owners:
+    row, other = ((ends.astype(np.int64)[:, None] * block + np.arange(block)).ravel() for ends in (receiver, sender))
+    return agreement.Owners.of(copies.own, row, copies.holder[other] == copies.position[other], copies.count)

@@ -1,0 +1,287 @@
+"""Protocols in rounds: what is counted and recorded as they go by, and when they end."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from consat.engine import Stop
+from consat.engine.checkpoint import Checkpoint, fingerprint
+from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
+from consat.engine.loop import Steps, follow
+from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
+from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, World, world_of
+from consat.engine.violations import shares
+from consat.numerics import float64
+from consat.problem.objective import Nu
+from consat.problem.team import Team
+from consat.problem.units import Scale
+from consat.protocols import Rounds
+from consat.protocols.estimates import Estimates
+from consat.results.trace import Ending, Trace
+
+ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
+"""What all must know for a run to end, for each stop rule."""
+WORD = 10
+"""Where agents tell each other of their bodies, a satisfied team goes on until all know it, for at most so many rounds a hop more."""
+FAR = 50
+"""Across more hops than these nobody waits for word to get around."""
+HOLD = 10
+"""How many rounds on end every margin must stay positive before a team counts as satisfied."""
+PATIENCE = 2000
+"""How many rounds a team may take when nobody says."""
+PATIENT = 1.5
+"""Whether a team that stands still has no hope is asked again only when the run is so many times as long: the answer takes its time."""
+SETTLED = 1e-5
+"""A team has settled when over a chunk no position moved by more than this fraction of the team's unit of length, …"""
+SETTLED_ALL_THE_SAME = 1e-7
+"""… or than this, where a certificate should say when it is `enough`."""
+
+
+@dataclass
+class Tally(Steps):
+    """What is counted of rounds.
+
+    Attributes:
+        streak: for how many rounds every margin has been positive.
+        near: for how many rounds all have known what ends the run; see `consat.engine.chunks.Ask`.
+        known: what all know; see `consat.engine.round.knowledge`.
+        infeasible_from: the round from which all have known that the team cannot be satisfied, or None.
+        last_bad: the last round whose margin was ≤ 0, or −1.
+        last_unknown: the last round after which not everybody knew, or −1.
+        messages: sent.
+        floats: sent.
+        smooth_margin: the last.
+        bound: the last.
+        asked: the round at which it was last asked whether there is hope.
+        violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
+    """
+
+    streak: int = 0
+    near: int = 0
+    last_bad: int = -1
+    last_unknown: int = -1
+    messages: int = 0
+    floats: int = 0
+    smooth_margin: float = np.nan
+    bound: float = np.nan
+    asked: int = 0
+    known: int = 0
+    infeasible_from: int | None = None
+    violated: Any = 0
+
+    def add(self, chunk: Chunk) -> np.ndarray:
+        """Count some rounds; gives their numbers."""
+        count = int(chunk.done)
+        numbers = np.arange(self.done + 1, self.done + 1 + count)
+        margin, known = np.asarray(chunk.margin)[:count], np.asarray(chunk.known)[:count]
+        bad, unknown = np.flatnonzero(~(margin > 0)), np.flatnonzero(known & SATISFIED == 0)
+        torn = np.flatnonzero(known & INFEASIBLE)
+        if self.infeasible_from is None and len(torn):
+            self.infeasible_from = int(numbers[torn[0]])
+        self.known, self.near = int(known[-1]), int(chunk.near)
+        self.streak = self.streak + count if not len(bad) else count - 1 - int(bad[-1])
+        self.last_bad = int(numbers[bad[-1]]) if len(bad) else self.last_bad
+        self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
+        self.messages += int(np.sum(np.asarray(chunk.messages)[:count]))
+        self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
+        self.violated = None if chunk.violated is None else np.asarray(self.violated) + np.asarray(chunk.violated)
+        self.done += count
+        self.margin, self.smooth_margin, self.bound = (float(leaf[count - 1]) for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound))
+        self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
+        return numbers
+
+
+def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> float:
+    """A chunk in which no position moved farther is one in which the team stood still; length: the team's unit."""
+    return (SETTLED if enough is None else SETTLED_ALL_THE_SAME) * length
+
+
+def longest_hold(protocol: Rounds, world: World) -> int:
+    """How many rounds on end a team may be satisfied before its run ends, though not all know it."""
+    hops = world.everyone.hops
+    return HOLD + (WORD * (1 + hops) if protocol.speaks == "pair" and hops <= FAR else 0)
+
+
+@float64
+def simulate_rounds(
+    team: Team,
+    protocol: Rounds,
+    copies: Estimates,
+    nu: Nu,
+    size: Scale,
+    first: np.ndarray,
+    *,
+    convex: bool,
+    rounds: int | None = None,
+    stop: Stop = "satisfied",
+    weather: Weather | None = None,
+    body: Body | None = None,
+    record: bool | None = None,
+    choice: Choice | None = None,
+    sink: Sink | None = None,
+    checkpoint: Checkpoint | None = None,
+    hopeless: Callable[[np.ndarray], bool] = lambda _: False,
+    enough: Callable[[np.ndarray], bool] | None = None,
+    progress: Callable[[float, float], None] = lambda *_: None,
+) -> Trace:
+    """Run a protocol in rounds.
+
+    Args:
+        team: whose clusters are connected.
+        protocol: what they do.
+        copies: the layout of estimates.
+        nu: the smoothing.
+        size: the team's natural size.
+        first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
+        convex: whether every ψ is known to be concave.
+        rounds: how many; `PATIENCE` if None.
+        stop: when to end earlier: every margin positive for `HOLD` rounds (or `hopeless` and settled); settled, or `enough`; or never.
+        weather: loss and sleep; none if None.
+        body: how fast positions follow estimates; at once if None.
+        record: whether to keep all estimates; if None, while they are few.
+        choice: what to record; if None, what the size of the team suggests.
+        sink: where to; in memory if None.
+        checkpoint: where to keep the state, and what to take up; nowhere and nothing if None.
+        hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
+        enough: says of (N, d) positions whether no formation is better by more than a tolerance.
+        progress: called with the fraction done (of the longest possible run) and the margin.
+    """
+    weather = weather or Weather()
+    choice = choice or Choice.of(team, copies, estimates=record)
+    most = HOLD
+    engine: Engine
+    if jax.process_count() > 1:
+        from consat.engine.cluster import ManyProcesses
+
+        hold = HOLD if stop == "satisfied" else None
+        engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
+    else:
+        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
+        most = longest_hold(protocol, world)
+        ends = (HOLD, most) if stop == "satisfied" else None
+        engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
+    rules = Rules(
+        end=PATIENCE if rounds is None else rounds, stop=stop, most=most, still=stillness(size.length, enough),
+        earliest=protocol.earliest(engine.world.everyone),
+        hopeless=hopeless, enough=enough,
+    )  # fmt: skip
+    problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
+    course = _Course(team, engine, rules, choice, body)
+    return follow(course, copies, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=problem, progress=progress)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When a run ends; see `simulate_rounds`.
+
+    Attributes:
+        end: rounds at most.
+        stop: when to end earlier.
+        most: how many satisfied rounds on end are the end, whether all know it or not.
+        still: a chunk in which no position moved farther is one in which the team stood still, length.
+        earliest: the round before which to stand still means nothing.
+        hopeless: see `simulate_rounds`.
+        enough: see `simulate_rounds`.
+    """
+
+    end: int
+    stop: Stop
+    still: float
+    most: int = HOLD
+    earliest: int = 0
+    hopeless: Callable[[np.ndarray], bool] = lambda _: False
+    enough: Callable[[np.ndarray], bool] | None = None
+
+    def ending(self, tally: Tally, positions: Callable[[], np.ndarray]) -> Ending | None:
+        """Why the run should end now, or None."""
+        if np.isnan(tally.drift) or (tally.drift == np.inf and not np.isfinite(positions()).all()):
+            return "diverged"
+        if self.stop == "never":
+            return None
+        if self.stop == "satisfied" and tally.streak >= HOLD and (tally.known & SATISFIED or tally.streak >= self.most):
+            return "satisfied"
+        if tally.near >= SURE:
+            return "settled"
+        if self.stop == "converged" and self.enough is not None and self.enough(positions()):
+            return "settled"
+        if tally.done < self.earliest or tally.drift > self.still:
+            return None
+        if self.stop == "converged":
+            return "settled"
+        if tally.done < PATIENT * tally.asked:
+            return None
+        tally.asked = tally.done
+        return "settled" if self.hopeless(positions()) else None
+
+
+class _Course:
+    """Rounds, for `consat.engine.loop`.
+
+    Args:
+        team: who runs.
+        engine: who carries them out.
+        rules: when they end.
+        choice: what is recorded.
+        body: see `simulate_rounds`.
+    """
+
+    def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None) -> None:
+        self._team, self._engine, self._rules, self._choice = team, engine, rules, choice
+        self._period = None if body is None else 1.0 / body.rate
+        self.tally, self.end = Tally(every=choice.every), rules.end
+        self.agree, self.positions = engine.agree, engine.positions
+
+    def start(self) -> tuple[Any, Rows]:
+        state, chunk = self._engine.start()
+        return state, self._count(chunk, 1)
+
+    def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
+        done = self.tally.done
+        state, chunk = self._engine.advance(state, done, min(CHUNK, self.end - done), (self.tally.streak, self.tally.near), every)
+        rows = self._count(chunk, every)
+        return state, rows, self._rules.ending(self.tally, functools.partial(self.positions, state))
+
+    def _count(self, chunk: Chunk, every: int) -> Rows:
+        numbers = self.tally.add(chunk)
+        chosen = np.flatnonzero(numbers % every == 0)
+        kept = Kept(*(np.asarray(leaf)[: len(chosen)] for leaf in chunk.kept))
+        margins = [np.asarray(leaf)[chosen] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound)]
+        return self._rows(numbers[chosen], margins, kept)
+
+    def look(self, state: Any) -> Rows:
+        tally = self.tally
+        margins = [np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound)]
+        return self._rows(np.array([tally.done]), margins, Kept(*(leaf[None] for leaf in self._engine.look(state))))
+
+    def _rows(self, step: np.ndarray, margins: Sequence[np.ndarray], kept: Kept) -> Rows:
+        margin, smooth_margin, bound = margins
+        estimate = None if self._choice.copies is None else kept.estimate
+        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound)
+
+    def told(self, rows: Rows) -> Mapping[str, Any]:
+        tally = self.tally
+        return {
+            "clock": "round",
+            "velocity": velocities(rows.step, rows.position, 1.0 if self._period is None else self._period),
+            "satisfied_from": float(tally.last_bad + 1) if tally.last_bad < tally.done else None,
+            "messages": tally.messages,
+            "floats_sent": tally.floats,
+            **_known(tally),
+            "period": self._period,
+            "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
+        }
+
+
+def _known(tally: Tally) -> Mapping[str, Any]:
+    """What all agents know at the end, and since when."""
+    if tally.known & SATISFIED:
+        return {"known": "satisfied", "known_from": tally.last_unknown + 1}
+    if tally.known & INFEASIBLE:
+        return {"known": "infeasible", "known_from": tally.infeasible_from}
+    return {"known": None, "known_from": None}

@@ -1,0 +1,76 @@
+"""The team in the terminal while it runs: a row an agent, with its margin, its rate, its links, and whether it is up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from consat.network.deploy.observer import Observer, Seen
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_KNOWN: Final = {
+    "satisfied": ", all know that all are satisfied",
+    "infeasible": ", all know that not all can be satisfied",
+}
+
+
+@contextmanager
+def board(title: str, *, quiet: bool) -> Iterator[Callable[[Observer, Mapping[str, bool], float], None]]:
+    """Draws a table on stderr, where that is a terminal: of what an observer knows, who runs, and the seconds since the start."""
+    import sys
+
+    if quiet or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(stderr=True), refresh_per_second=8, transient=True) as live:
+        yield lambda observer, running, seconds: live.update(table(title, observer, running, seconds))
+
+
+def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: float) -> Table:
+    """Drawn with rich."""
+    from rich.table import Table
+    from rich.text import Text
+
+    margins = [seen.report["margin"] for seen in observer.seen.values() if seen.report and seen.report["margin"] is not None]
+    worst = f", margin {min(margins):+.4g}" if margins else ""
+    known = _KNOWN.get(observer.all_known()[0] or "", "")
+    drawn = Table(title=f"{title}: {seconds:.1f} s{worst}{known}", title_justify="left")
+    for column in ("agent", "state", "margin", "turns/s", "loss", "round trip", "deaf to"):
+        drawn.add_column(column, justify="left" if column in ("agent", "state", "deaf to") else "right")
+    for agent, seen in observer.seen.items():
+        up = running.get(agent, False)
+        peers = seen.report["peers"] if seen.report else {}
+        margin = seen.report["margin"] if seen.report else None
+        loss = [peer["loss"] for peer in peers.values()]
+        trips = [peer["trip"] for peer in peers.values() if peer["trip"] is not None]
+        drawn.add_row(
+            agent,
+            Text(_state(seen, up=up), style="" if up else "bold red"),
+            "" if margin is None else Text(f"{margin:+.4g}", style="green" if margin > 0 else "red"),
+            f"{_rate(seen):.0f}",
+            f"{np.mean(loss):.0%}" if loss else "",
+            f"{1e3 * np.mean(trips):.1f} ms" if trips else "",
+            Text(" ".join(other for other, peer in peers.items() if not peer["up"]), style="red"),
+        )
+    return drawn
+
+
+def _state(seen: Seen, *, up: bool) -> str:
+    if not up:
+        return "ended" if seen.ended is not None else "down"
+    if seen.report is None:
+        return "starting"
+    return seen.known or ("running" if seen.stamps else "waiting")
+
+
+def _rate(seen: Seen) -> float:
+    """Turns a second, over the last report."""
+    return len(seen.report["track"]) / 0.1 if seen.report else 0.0

@@ -1,0 +1,77 @@
+"""Commands to a body that somebody else moves. The first is to stand, and so is the last, whatever ends the agent."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from consat.network.node.body import MeasuredBody
+from consat.network.node.orders import Orders
+
+VALID: Final = 0.5
+"""A command is valid for so long, s: a robot that has got no other by then must stand."""
+PERIOD: Final = 0.1
+"""Time between two commands at most, s."""
+
+
+class Helm:
+    """Commands a measured body while its position is known; of a simulated one there is nothing to command.
+
+    Args:
+        me: the agent.
+        dimension: of a velocity.
+        body: whose position is measured; None for a simulated one.
+        timeout: after so long without a measurement, s, the sensor counts as lost.
+        write: takes events.
+    """
+
+    def __init__(self, me: str, dimension: int, body: MeasuredBody | None, timeout: float, write: Callable[[dict[str, Any]], None]) -> None:
+        self._me, self._still, self._body, self._timeout, self._write = me, np.zeros(dimension), body, timeout, write
+        self._began = math.inf
+        self._target: np.ndarray | None = None
+        self._due = -math.inf
+        self._lost = self._over = False
+        self._command(self._still)
+
+    def sense(self, orders: Orders) -> None:
+        """Hand on the measurements that have come, and say which are not believed."""
+        for line, new in orders.measurements():
+            if self._body is not None and (why := self._body.measure(new)) is not None:
+                self._log("rejected", line=line, why=why)
+
+    def steer(self, target: np.ndarray | None) -> None:
+        """Command what is due, towards `target`, (d,), if that is known: when it is a new one, and at least every `PERIOD`."""
+        if self._body is None:
+            return
+        now = time.monotonic()
+        self._began = min(self._began, now)
+        lost = not self._body.sensed(now) and now - self._began > self._timeout
+        if lost == self._lost and target is self._target and now < self._due:
+            return
+        if lost != self._lost:
+            self._lost = lost
+            self._log("unmeasured" if lost else "measured")
+            self._complain(f"has no measurement for {self._timeout:g} s, and stands" if lost else "is measured again")
+        self._target, self._due = target, now + PERIOD
+        self._command(self._still if target is None or self._over else self._body.follow(target, now))
+
+    def stand(self) -> None:
+        """Command to stand, for good."""
+        self._over = True
+        self._command(self._still)
+
+    def _command(self, velocity: np.ndarray) -> None:
+        if self._body is not None:
+            self._log("command", velocity=velocity.tolist(), valid_for=VALID)
+
+    def _log(self, event: str, **details: Any) -> None:
+        self._write({"event": event, "id": self._me, "t": time.monotonic(), **details})
+
+    def _complain(self, what: str) -> None:
+        sys.stderr.write(f"consat: agent {self._me!r} {what}\n")
+        sys.stderr.flush()

@@ -1,0 +1,123 @@
+"""What an agent's process is told: orders and measurements, as lines on stdin, and signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Final
+
+import numpy as np
+
+from consat.network.node.body import Measurement
+from consat.network.node.core import LARGEST
+
+LONGEST_LINE: Final = 65536
+"""Bytes read of a line on stdin."""
+SHOWN: Final = 80
+"""Characters of a line that are reported."""
+HELD: Final = 256
+"""Measurements, and lines to report, that are kept while the agent is busy: the newest."""
+
+
+class Orders:
+    """What stdin and signals have said.
+
+    Args:
+        dimension: of measured positions; None where nobody measures any.
+        reading: whether to read stdin.
+    """
+
+    def __init__(self, dimension: int | None, *, reading: bool) -> None:
+        self.stopped = ""
+        self.leaving = False
+        self._dimension = dimension
+        self._measurements: deque[tuple[str, Measurement]] = deque(maxlen=HELD)
+        self._rejected: deque[tuple[str, str]] = deque(maxlen=HELD)
+        if reading:
+            threading.Thread(target=self._read, name="stdin", daemon=True).start()
+
+    def measurements(self) -> Iterator[tuple[str, Measurement]]:
+        """The lines that are measurements, each once."""
+        while self._measurements:
+            yield self._measurements.popleft()
+
+    def rejected(self) -> Iterator[tuple[str, str]]:
+        """The lines that mean nothing, each once, and why."""
+        while self._rejected:
+            yield self._rejected.popleft()
+
+    def _read(self) -> None:
+        for line in _lines(sys.stdin.fileno()):
+            if (why := self._take(line)) is not None:
+                self._rejected.append((line[:SHOWN], why))
+        self.stopped = self.stopped or "stdin ended"
+
+    def _take(self, line: str) -> str | None:
+        """Heed a line; or why not."""
+        try:
+            order = json.loads(line)
+        except (ValueError, RecursionError):
+            return "it is no JSON"
+        command = order.get("command") if isinstance(order, dict) else None
+        if command == "stop":
+            self.stopped = "told to stop"
+        elif command == "leave":
+            self.leaving = True
+        elif isinstance(order, dict) and "position" in order:
+            return self._measure(line, order["position"], order.get("stamp"))
+        else:
+            return 'it must be {"position": [...]}, {"command": "stop"} or {"command": "leave"}'
+        return None
+
+    def _measure(self, line: str, position: Any, stamp: Any) -> str | None:
+        if self._dimension is None:
+            return "the position of this agent is simulated; start it with --sensor stdin to measure it"
+        if not (isinstance(position, list) and len(position) == self._dimension and all(map(_is_coordinate, position))):
+            return f"position must be a list of {self._dimension} finite numbers"
+        if not (stamp is None or _is_coordinate(stamp)):
+            return "stamp must be a finite number"
+        new = Measurement(np.array(position, dtype=float), time.monotonic(), None if stamp is None else float(stamp))
+        self._measurements.append((line[:SHOWN], new))
+        return None
+
+
+def _lines(descriptor: int) -> Iterator[str]:
+    """The lines of a file. One longer than `LONGEST_LINE` is cut there; a byte that is no UTF-8 becomes a mark.
+
+    Not through `sys.stdin`: its lock, held by a thread that waits there, would abort the process at its end.
+    """
+    rest = b""
+    while data := os.read(descriptor, LONGEST_LINE):
+        *lines, rest = (rest + data).split(b"\n")
+        rest = rest[:LONGEST_LINE]
+        yield from (line[:LONGEST_LINE].decode(errors="replace").strip() for line in lines)
+    if rest:
+        yield rest.decode(errors="replace").strip()
+
+
+def _is_coordinate(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+@contextmanager
+def heeding_signals(orders: Orders) -> Iterator[None]:
+    """SIGTERM, SIGHUP and Ctrl-C stop the agent after its step, so that it can command to stand, and say goodbye."""
+
+    def stop(number: int, _: FrameType | None) -> None:
+        orders.stopped = signal.Signals(number).name
+
+    heeded = [number for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, stop) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,411 @@
+"""What one agent is given: its own constraints, the positions it holds, its neighbours' names and addresses, and common knowledge.
+
+`split` makes the parts of a scenario, `write_part` and `read_part` put them into private files. A file is a scenario of one agent, in the
+same words, in a frame that says how it talks to its neighbours; nothing in it is ever evaluated. It tells of the other agents only their
+names, and of neighbours their addresses, which positions both hold, how many links share each at the other end, and what travels between
+them.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+from pydantic import Field, StringConstraints, ValidationError
+
+from consat.errors import AT_KEY, Fault, InvalidSettings, closest, counted, shown
+from consat.numerics import float64
+from consat.problem.family import Family
+from consat.problem.objective import Nu
+from consat.problem.team import Agent, Team
+from consat.scenario import Scenario, dump
+from consat.scenario.document import LARGEST, Document, decode, read
+from consat.scenario.schema import build
+from consat.scenario.writing import write
+from consat.settings import Gain, Model, Number, Settings, Smoothing
+
+VERSION: Final = 2
+"""Since parts tell along which links positions and the level travel. Others are refused."""
+PORT: Final = 7447
+"""Of the first agent, where nobody says."""
+
+RUNS: Final = {"interior-point": "interior-point", "admm": "admm", "link": "gradient-flow", "lockstep": "interior-point"}
+"""The protocol of each mode, where nobody names one."""
+
+Word = Annotated[str, StringConstraints(min_length=1, max_length=200)]
+Endpoint = Annotated[str, StringConstraints(pattern=r"^(tcp|tls|udp|quic)/[^\s/]+:[0-9]{1,5}$")]
+
+
+class Neighbour(Model):
+    """What an agent knows of one it talks to.
+
+    Attributes:
+        id: its name.
+        address: where it listens.
+        shares: the agents whose positions both ends hold, in the team's order.
+        degrees: for each of them, over how many links the neighbour shares it.
+        travels: those of `shares` whose positions travel over this link in the interior-point protocol, each along a tree of its holders.
+        level: whether the level does, along a spanning tree of the cluster.
+    """
+
+    id: Word
+    address: Endpoint
+    shares: tuple[Word, ...] = Field(min_length=1)
+    degrees: tuple[Annotated[int, Field(ge=1, le=10**6)], ...]
+    travels: tuple[Word, ...]
+    level: bool
+
+
+class _File(Model):
+    """The frame of a part file."""
+
+    version: int = Field(alias="consat-part")
+    run: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+    agent: Word
+    listen: Endpoint
+    length: Gain
+    psi: Gain
+    center: tuple[Number, ...]
+    reach: Gain
+    convex: bool
+    exact: bool
+    hops: Annotated[int, Field(ge=0, le=10**6)]
+    first: dict[Word, tuple[Number, ...]]
+    absent: tuple[Word, ...] = ()
+    neighbours: tuple[Neighbour, ...] = ()
+    scenario: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One agent's own part of a scenario.
+
+    Attributes:
+        name: of the scenario.
+        run: names the team's run on the network; agents of other runs are not heard.
+        me: the agent.
+        listen: its own address.
+        length: the team's unit of length.
+        psi: the team's unit of ψ; see `consat.protocols.local.interior.Units`.
+        center: (d,) the team's middle.
+        reach: how far around it the team's places are; see `consat.problem.units.Region`.
+        convex: whether every ψ of the team is proven concave.
+        exact: whether what agents share travels along trees, so that proofs can be told; see `consat.protocols.local.interior.layout.Plan`.
+        hops: links that a message crosses, at most, from one agent to another.
+        team: a team in which it alone has constraints; the others are the agents whose positions it holds.
+        settings: protocol and smoothing.
+        first: (copies, d) first estimates of the positions it holds, in the order of `team.ids`.
+        absent: agents that are not there in the beginning, and may join.
+        neighbours: whom it talks to, in the team's order.
+    """
+
+    name: str
+    run: str
+    me: str
+    listen: str
+    length: float
+    psi: float
+    center: np.ndarray
+    reach: float
+    convex: bool
+    exact: bool
+    hops: int
+    team: Team
+    settings: Settings
+    first: np.ndarray
+    absent: frozenset[str]
+    neighbours: tuple[Neighbour, ...]
+
+    @property
+    def nu(self) -> Nu:
+        """The smoothing, constant over a run: whoever starts anew later has the same."""
+        smoothing = self.settings.smoothing
+        assert isinstance(smoothing, Smoothing)
+        assert isinstance(smoothing.nu_beta, float)
+        return Nu(smoothing.nu_alpha, smoothing.nu_beta)
+
+    def problem(self, mode: str) -> bytes:
+        """8 bytes that agree among agents of the same run, mode and common knowledge; nothing private is in them."""
+        settings = self.settings.model_dump(mode="json", include={"protocol", "smoothing"})
+        settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
+        common = {
+            "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "psi": self.psi,
+            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex, "exact": self.exact,
+            "settings": settings,
+        }  # fmt: skip
+        return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
+
+    def without(self, gone: Collection[str]) -> Part:
+        """What is left when some agents are not there: no constraint that reads them, no copy of them, no link to them."""
+        if not gone:
+            return self
+        kept = [number for number, agent in enumerate(self.team.ids) if agent not in gone]
+        degrees = {neighbour.id: dict(zip(neighbour.shares, neighbour.degrees, strict=True)) for neighbour in self.neighbours}
+        neighbours = []
+        for neighbour in self.neighbours:
+            shares = tuple(agent for agent in neighbour.shares if agent not in gone)
+            if shares and neighbour.id not in gone:
+                known = degrees[neighbour.id]
+                kept_of = {
+                    "shares": shares,
+                    "degrees": tuple(known[agent] for agent in shares),
+                    "travels": tuple(agent for agent in neighbour.travels if agent not in gone),
+                }
+                neighbours.append(neighbour.model_copy(update=kept_of))
+        return replace(self, team=_restricted(self.team, kept), first=self.first[kept], neighbours=tuple(neighbours))
+
+
+def _restricted(team: Team, kept: Sequence[int]) -> Team:
+    """The team of some of its agents, with the constraints that read only them."""
+    place = np.full(team.count, -1, dtype=np.int32)
+    place[list(kept)] = np.arange(len(kept))
+    whole = [np.all(place[family.agents] >= 0, axis=1) for family in team.families]
+    numbers = np.sort(
+        np.concatenate([np.zeros(0, dtype=np.int32), *(family.number[stays] for family, stays in zip(team.families, whole, strict=True))])
+    )
+    families = [_members(family, np.flatnonzero(stays), place, numbers) for family, stays in zip(team.families, whole, strict=True)]
+    bare = Team([Agent(team.ids[i], (), team.starts[i] if np.isfinite(team.starts[i]).all() else None) for i in kept], [], team.dimension)
+    names = [team.names[int(number)] for number in numbers]
+    return bare.with_constraints([family for family in families if family.size], place[team.owner[numbers]], names)
+
+
+def _members(family: Family, which: np.ndarray, place: np.ndarray, numbers: np.ndarray) -> Family:
+    return replace(
+        family,
+        agents=place[family.agents[which]],
+        owner=place[family.owner[which]],
+        number=np.searchsorted(numbers, family.number[which]).astype(np.int32),
+        parameters={key: value[which] for key, value in family.parameters.items()},
+        weight=family.weight[which],
+        sources=None if family.sources is None else tuple(family.sources[int(k)] for k in which),
+    )
+
+
+def _private(team: Team, owner: int, held: np.ndarray) -> Team:
+    """The team as its agent `owner` may know it: its own constraints over the positions it holds."""
+    number = [np.flatnonzero(family.owner == owner) for family in team.families]
+    mine = np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(f.number[k] for f, k in zip(team.families, number, strict=True))]))
+    place = np.full(team.count, -1, dtype=np.int32)
+    place[held] = np.arange(len(held))
+    families = [_members(family, which, place, mine) for family, which in zip(team.families, number, strict=True)]
+    bare = Team([Agent(team.ids[int(i)]) for i in held], [], team.dimension)
+    return bare.with_constraints([f for f in families if f.size], place[team.owner[mine]], [team.names[int(k)] for k in mine])
+
+
+@float64
+def split(
+    scenario: Scenario,
+    *,
+    run: str | None = None,
+    addresses: Mapping[str, str] | None = None,
+    port: int = PORT,
+    absent: Collection[str] = (),
+    only: str | None = None,
+) -> dict[str, Part]:
+    """The parts of a scenario, by agent.
+
+    Who holds what, and along which links it travels, suits the protocol that the scenario names, or the team's default.
+
+    Args:
+        scenario: whose protocol, seed and smoothing are those of the run.
+        run: its name on the network; if None, one that everybody who splits the same scenario finds.
+        addresses: where agents listen, such as ``tcp/192.168.0.7:7447``; on this machine, one port after the other, where not given.
+        port: the first of them.
+        absent: agents that are not there in the beginning, and may join.
+        only: make the part of this agent alone.
+
+    Raises:
+        InvalidTeam: a cluster is not connected by links.
+        InvalidSettings: an address or an absent agent that the team does not have.
+    """
+    from consat.certify.quadratics import shape_of
+    from consat.problem.graphs import hops
+    from consat.problem.objective import Schedule
+    from consat.problem.units import automatic, scale
+    from consat.protocols.local.interior import Shared, Units
+    from consat.runs.preparation import DEFAULT_PROTOCOL, copies_of, default_protocol, first_estimates
+
+    team, settings = scenario.team, scenario.settings
+    addresses = addresses or {}
+    for named in (*addresses, *absent, *(() if only is None else (only,))):
+        if named not in team.ids:
+            raise InvalidSettings(f"there is no agent {named!r}{closest(named, team.ids)}")
+    if not 1 <= port <= 65536 - team.count:
+        raise InvalidSettings(f"port is {port}, but must leave room for {team.count} ports below 65536")
+    copies, size = copies_of(team, settings.protocol), scale(team)
+    schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+    default = default_protocol(team, settings.protocol.estimates)
+    named = settings.protocol.kind or (None if default == DEFAULT_PROTOCOL else default)
+    common = Settings(
+        protocol=settings.protocol.model_copy(update={"kind": named}),
+        smoothing=Smoothing(nu_alpha=float(schedule.final.alpha), nu_beta=float(schedule.final.beta)),
+    )
+    first, concave = first_estimates(team, copies, settings.start, size), shape_of(team).concave
+    listen = [addresses.get(agent, f"tcp/127.0.0.1:{port + i}") for i, agent in enumerate(team.ids)]
+    degree = np.bincount(copies.edges[:, 0], minlength=copies.count)
+    run = run or f"{_word(scenario.name)}-{hashlib.sha256(scenario.text.encode()).hexdigest()[:12]}"
+    across, unit = hops(team.count, copies.links), float(Units.of(size).psi)
+    shared = Shared.of(copies)
+    pair_of = {(int(here), int(there)): k for k, (here, there) in enumerate(shared.pairs)}
+    rows_of = np.split(shared.row, np.searchsorted(shared.pair, np.arange(1, max(len(shared.pairs), 1))))
+    parts = {}
+    for owner, agent in enumerate(team.ids):
+        if only is not None and agent != only:
+            continue
+        rows = np.flatnonzero(copies.holder == owner)
+        ends = copies.edges[np.isin(copies.edges[:, 0], rows)]
+        others = copies.holder[ends[:, 1]]
+        neighbours = []
+        for other in np.unique(others):
+            far, shares = ends[others == other, 1], rows_of[pair_of[owner, int(other)]]
+            neighbours.append(
+                Neighbour(
+                    id=team.ids[other],
+                    address=listen[other],
+                    shares=tuple(team.ids[i] for i in copies.position[far]),
+                    degrees=tuple(map(int, degree[far])),
+                    travels=tuple(team.ids[i] for i in copies.position[shares[shares >= 0]]),
+                    level=bool((shares < 0).any()),
+                )
+            )
+        parts[agent] = Part(
+            scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
+            _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
+        )  # fmt: skip
+    return parts
+
+
+def _word(name: str) -> str:
+    return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in name)[:40]
+
+
+def write_part(part: Part) -> str:
+    """The private file of an agent.
+
+    Raises:
+        InvalidTeam: it has constraints that are Python functions; no file can hold them.
+    """
+    scenario = read(dump(part.team, part.settings, part.name), part.me).root
+    assert scenario is not None
+    return write(
+        {
+            "consat-part": VERSION,
+            "run": part.run,
+            "agent": part.me,
+            "listen": part.listen,
+            "length": part.length,
+            "psi": part.psi,
+            "center": part.center.tolist(),
+            "reach": part.reach,
+            "convex": part.convex,
+            "exact": part.exact,
+            "hops": part.hops,
+            "first": {agent: row.tolist() for agent, row in zip(part.team.ids, part.first, strict=True)},
+            "absent": sorted(part.absent),
+            "neighbours": [neighbour.model_dump(mode="json") for neighbour in part.neighbours],
+            "scenario": scenario.plain,
+        }
+    )
+
+
+def is_part(text: str, file: str) -> bool:
+    """Whether a text is a part file rather than a scenario."""
+    root = read(text, file).root
+    return root is not None and isinstance(root.value, dict) and "consat-part" in root.value
+
+
+def load_text(file: Path) -> str:
+    """The text of a file, of a size that is read at all; raises as `consat.scenario.load` does."""
+    with file.open("rb") as stream:
+        return decode(stream.read(LARGEST + 1), str(file))
+
+
+def read_part(text: str, file: str) -> Part:
+    """Read what `write_part` wrote.
+
+    Raises:
+        InvalidScenario: names every fault with its line and column.
+    """
+    document = read(text, file)
+    data = document.root.plain if document.root else None
+    if not isinstance(data, dict) or "scenario" not in data or not isinstance(data["scenario"], dict):
+        raise document.invalid([Fault((), "this is no part of a scenario; consat split writes them")])
+    if data.get("consat-part") != VERSION:
+        message = f"the version is {shown(data.get('consat-part'))}, but this consat reads {VERSION}; split the scenario again"
+        raise document.invalid([Fault(("consat-part",), message)])
+    try:
+        frame = _File.model_validate(data)
+    except ValidationError as error:
+        raise document.invalid(_complaints(error, data)) from None
+    if document.faults:
+        raise document.invalid()
+    assert document.root is not None
+    team, settings, name = build(Document(file, document.root.value["scenario"]))
+    if faults := list(_unfit(frame, team, settings)):
+        raise document.invalid(faults)
+    return Part(
+        name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
+        frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
+        np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
+    )  # fmt: skip
+
+
+def _complaints(error: ValidationError, data: Any) -> list[Fault]:
+    faults = []
+    for item in error.errors(include_url=False):
+        path = tuple(part for part in item["loc"] if part != "[key]")
+        if item["type"] == "extra_forbidden":
+            faults.append(Fault(path, f"there is no key {shown(path[-1])} in a part", offset=AT_KEY))
+        elif item["type"] == "missing":
+            faults.append(Fault(path[:-1], f"{path[-1]} is missing"))
+        else:
+            value = functools.reduce(lambda inner, key: inner[key], path, data)
+            faults.append(Fault(path, f"it is {shown(value)}, but {_must(item['msg'])}"))
+    return faults
+
+
+def _must(message: str) -> str:
+    """Pydantic's words, as consat says it."""
+    return message.removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
+
+
+def _unfit(frame: _File, team: Team, settings: Settings) -> Iterator[Fault]:
+    """Where the frame and the scenario within contradict each other."""
+    if set(frame.first) != set(team.ids):
+        yield Fault(("first",), f"first must have the agents of the scenario within, {', '.join(team.ids)}")
+    if len(frame.center) != team.dimension:
+        yield Fault(("center",), f"it has {counted(len(frame.center), 'number')}, but must have {team.dimension}, one for each dimension")
+    for agent, row in frame.first.items():
+        if len(row) != team.dimension:
+            yield Fault(("first", agent), f"it has {counted(len(row), 'number')}, but must have {team.dimension}, one for each dimension")
+    if frame.agent not in team.ids:
+        yield Fault(("agent",), f"agent {frame.agent!r} is not among the agents of the scenario within")
+    elif any(team.ids[owner] != frame.agent for owner in team.owner):
+        yield Fault(("scenario", "agents"), f"an agent other than {frame.agent!r} has constraints, but a part holds only its agent's own")
+    smoothing = settings.smoothing
+    if not isinstance(smoothing, Smoothing) or not isinstance(smoothing.nu_beta, float):
+        yield Fault(("scenario",), "smoothing must give nu_alpha and nu_beta as numbers, for all agents must have the same")
+    yield from _unfit_neighbours(frame, team)
+
+
+def _unfit_neighbours(frame: _File, team: Team) -> Iterator[Fault]:
+    known: set[str] = {frame.agent}
+    for k, neighbour in enumerate(frame.neighbours):
+        path = ("neighbours", k)
+        if neighbour.id in known:
+            yield Fault((*path, "id"), f"{neighbour.id!r} is the agent itself or stands here for the second time; keep one")
+        known.add(neighbour.id)
+        if len(neighbour.degrees) != len(neighbour.shares):
+            yield Fault((*path, "degrees"), f"it has {counted(len(neighbour.degrees), 'number')}, but must have one for each of shares")
+        if unknown := [agent for agent in neighbour.shares if agent not in team.ids]:
+            yield Fault((*path, "shares"), f"{unknown[0]!r} is not among the agents of the scenario within")
+        elif sorted(neighbour.shares, key=team.ids.index) != list(dict.fromkeys(neighbour.shares)):
+            yield Fault((*path, "shares"), "it must name each agent once, in the order of the scenario within")
+        elif list(neighbour.travels) != [agent for agent in neighbour.shares if agent in neighbour.travels]:
+            yield Fault((*path, "travels"), "it must name agents of shares, each once, in their order")

@@ -1,0 +1,127 @@
+"""One agent's own objective and own ends of its links: what `consat.protocols` asks for, of a `Part` alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.network.node.part import Part
+from consat.numerics import Groups
+from consat.problem.objective import Nu, Objective
+from consat.problem.units import Region
+from consat.protocols.estimates import Estimates
+from consat.protocols.local import proximal as prox
+from consat.protocols.local.interior import Interior, Shared, Units
+from consat.protocols.solver import EXACT, LocalSolver
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class OwnLinks:
+    """`consat.protocols.Links` of one agent.
+
+    Attributes:
+        row: (E,) the copy at each end.
+        groups: groups the ends by copy.
+        degree: (rows,).
+        metropolis: (E,).
+    """
+
+    row: Array
+    groups: Groups
+    degree: Array
+    metropolis: Array
+
+    @classmethod
+    def of(cls, part: Part) -> OwnLinks:
+        """The ends in the order of `ends`."""
+        index = {agent: row for row, agent in enumerate(part.team.ids)}
+        known = {neighbour.id: dict(zip(neighbour.shares, neighbour.degrees, strict=True)) for neighbour in part.neighbours}
+        pairs = ends(part)
+        row = np.array([index[agent] for _, agent in pairs], dtype=np.int32)
+        degree = np.bincount(row, minlength=part.team.count)
+        theirs = np.array([known[neighbour][agent] for neighbour, agent in pairs], dtype=float)
+        return cls(
+            jnp.asarray(row),
+            Groups.of(row, part.team.count),
+            jnp.asarray(degree, dtype=float),
+            jnp.asarray(1.0 / (1.0 + np.maximum(degree[row], theirs))),
+        )
+
+    def at(self, rows: Array) -> Array:
+        return rows[self.row]
+
+    def sum(self, links: Array) -> Array:
+        return self.groups.sum(links)
+
+    def least(self, links: Array) -> Array:
+        return -self.groups.max(-links)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Alone(LocalSolver):
+    """One agent.
+
+    Attributes:
+        links: its ends of its links.
+        me: its own row.
+    """
+
+    links: OwnLinks
+    me: int = field(metadata={"static": True})
+
+    @classmethod
+    def of(cls, part: Part, speaks: str = "link") -> Alone:
+        """The solver of a part; its rows are in the order of `part.team.ids`, and it is agent 0 of one. Speaks: see
+        `consat.protocols.Rounds`."""
+        team = part.team
+        me = team.ids.index(part.me)
+        return cls(
+            links=OwnLinks.of(part),
+            length=jnp.asarray(part.length),
+            region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
+            interior=_interior(part) if speaks == "pair" else None,
+            plan=_plan(part, me) if speaks == "link" else None,
+            nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
+            local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
+            holder=jnp.zeros(team.count, dtype=np.int32),
+            own=jnp.array([me], dtype=np.int32),
+            talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
+            hops=part.hops,
+            convex=part.convex,
+            precision=EXACT,
+            me=me,
+        )
+
+
+def _plan(part: Part, me: int) -> prox.Plan:
+    plan = prox.buckets(part.team, lambda _, position: position, part.team.count, part.convex)
+    batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
+    return prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1)
+
+
+def _interior(part: Part) -> Interior:
+    """Of the agent as a team of one, whose constraints read its copies; its pairs are in the order of `part.neighbours`."""
+    team, none = part.team, np.zeros((0, 2), dtype=np.int32)
+    number = np.arange(team.count, dtype=np.int32)
+    rows = [[*map(team.ids.index, neighbour.travels), *[-1] * neighbour.level] for neighbour in part.neighbours]
+    pair = np.repeat(np.arange(len(rows)), [len(shares) for shares in rows])
+    talks = np.stack([np.zeros(len(rows), dtype=np.int32), np.arange(len(rows), dtype=np.int32)], axis=1)
+    me = np.array([team.ids.index(part.me)], dtype=np.int32)
+    families = [replace(family, owner=np.zeros_like(family.owner)) for family in team.families]
+    one = team.with_constraints(families, np.zeros_like(team.owner), team.names)
+    one.ids = (part.me,)
+    copies = Estimates("local", np.zeros_like(number), number, me, none, np.zeros(1, dtype=np.int32), none)
+    units = Units(*(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length)))
+    shared = Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int), part.exact)
+    return Interior.alone(one, copies, shared, units)
+
+
+def ends(part: Part) -> list[tuple[str, str]]:
+    """(neighbour, agent) for each end of a link: over which, and whose position; ordered by position, then by neighbour."""
+    return [(neighbour.id, agent) for agent in part.team.ids for neighbour in part.neighbours if agent in neighbour.shares]

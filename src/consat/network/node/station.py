@@ -1,0 +1,356 @@
+"""What every mode of talking shares: an agent's core, neighbours, membership, body and log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from consat.network.node import guard
+from consat.network.node.body import Body
+from consat.network.node.core import LARGEST, Embodied, Look, Moment, Rows
+from consat.network.node.membership import Membership
+from consat.network.node.neighbours import Peers
+from consat.network.node.part import Part
+from consat.network.transports import Transport
+from consat.network.wire import Expected, Kind, Message, Numbers
+
+SILENT: Final = 0.5
+"""A neighbour that was not heard for so long, s, counts as down."""
+REPORT: Final = 0.1
+"""Time between two reports, s."""
+
+Knowledge = Literal["satisfied", "infeasible"] | None
+"""What an agent knows of the whole team: that all are satisfied; that they cannot be, proven; or neither."""
+Log = Callable[[dict[str, Any]], None]
+
+
+class Station:
+    """One agent, whatever its mode.
+
+    Args:
+        part: the agent's own.
+        core: what it computes.
+        mode: the word for it; agents of another mode are not understood.
+        transport: over which it talks.
+        clock: own, s.
+        incarnation: larger after each restart.
+        body: sensor and actuator.
+        log: takes events, which are plain data.
+        frames: how many rounds a message carries.
+        stamped: whether it also carries the number of the round.
+        give_up: a neighbour silent for so long has left for good, s.
+        report: time between two reports, s; 0 reports after each turn.
+    """
+
+    def __init__(
+        self,
+        part: Part,
+        core: Embodied,
+        mode: str,
+        transport: Transport,
+        *,
+        clock: Callable[[], float],
+        incarnation: int,
+        body: Body,
+        log: Log,
+        frames: int = 1,
+        stamped: bool = False,
+        give_up: float = np.inf,
+        report: float = REPORT,
+    ) -> None:
+        self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
+        self.membership = Membership(part)
+        self.peers = Peers(
+            part,
+            part.problem(mode),
+            {
+                neighbour.id: _expected(len(neighbour.shares), core.largest, core.letters[neighbour.id], frames, stamped)
+                for neighbour in part.neighbours
+            },
+            transport,
+            clock,
+            incarnation,
+        )
+        self._log, self._give_up, self._period = log, give_up, report
+        self._born = clock()
+        self._track: list[list[float]] = []
+        self._known: Knowledge = None
+        self._near = False
+        self._down = frozenset(self.peers.all)
+        self._next_report = clock()
+        self._gone: frozenset[str] = frozenset()
+        self._look: Look | None = None
+        self.target: np.ndarray | None = None
+        """(d,) where the body should be, once that is known."""
+        self.regroup(None, part.first)
+
+    # -- who is there ------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def present(self) -> list[str]:
+        """The neighbours that are there."""
+        return [neighbour.id for neighbour in self.core.part.neighbours]
+
+    def regroup(self, state: Any, first: np.ndarray) -> Any:
+        """Go on among those who are there: the core and the state for them. Nothing changes if nobody has come or gone."""
+        gone = self.membership.gone
+        if gone != self._gone:
+            for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
+                if state is not None and agents:
+                    self.log(event, agents=sorted(agents))
+            before, self.core = self.core, self.core.among(gone)
+            self._gone, self._look = gone, None
+            if state is not None:
+                state = self.core.carry(before, state, self.among(first))
+        place = {end: k for k, end in enumerate(self.core.ends)}
+        self._places = {
+            neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
+            for neighbour in self.part.neighbours
+        }
+        self._turn_of = {neighbour: k for k, neighbour in enumerate(self.present)}
+        return state
+
+    def among(self, first: np.ndarray) -> np.ndarray:
+        """The rows of `first`, of all agents of the part, that belong to those who are there."""
+        return first[[agent not in self._gone for agent in self.part.team.ids]]
+
+    @property
+    def changed(self) -> bool:
+        """Whether somebody has come or gone since the last `regroup`."""
+        return self.membership.gone != self._gone
+
+    def first(self) -> np.ndarray:
+        """(rows, d) first estimates of all agents of the part, its own position as measured."""
+        first = self.part.first.copy()
+        position = self.body.position()
+        if position is not None:
+            first[self.part.team.ids.index(self.part.me)] = position
+        return first
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether it knows that all are."""
+        return self._known == "satisfied"
+
+    @property
+    def known(self) -> Knowledge:
+        """What it knows of the team."""
+        return self._known
+
+    @property
+    def settled(self) -> bool:
+        """Whether it knows all that there is to find: that all are satisfied, or that they cannot be and are near the best."""
+        return self.satisfied or (self._known == "infeasible" and self._near)
+
+    # -- messages ----------------------------------------------------------------------------------------------------------------------
+
+    def hear(self) -> list[Message]:
+        """What came; news of who is there is taken in already."""
+        messages = self.peers.hear()
+        for message in messages:
+            if message.kind is not Kind.GOODBYE:
+                shares = self.peers.all[message.source].known.shares
+                epochs = message.arrays[0] if message.kind is Kind.HELLO else message.arrays[0][:, -1]
+                self.membership.hear(shares, epochs)
+        now = self.clock()
+        for neighbour in self.present:
+            peer = self.peers.all[neighbour]
+            if now - max(peer.heard, self._born) > self._give_up:
+                self.membership.drop(neighbour)
+        return messages
+
+    def blocks(self, outbox: Rows) -> dict[str, list[np.ndarray]]:
+        """What to tell each neighbour: of the rows that the core says of links, (shares, width + 1), zeros for who is gone, and last who is
+        there; and of those that it says to neighbours its own."""
+        told = {}
+        for neighbour, place in self._places.items():
+            block = np.zeros((len(place), self.core.width + 1))
+            block[place >= 0, :-1] = outbox.link[place[place >= 0]]
+            block[:, -1] = self.membership.of(self.peers.all[neighbour].known.shares)
+            letter, row = np.zeros(self.core.letters[neighbour].shape), self._turn_of.get(neighbour)
+            if row is not None:
+                letter = outbox.pair[row, : len(letter)]
+            told[neighbour] = [block, letter]
+        return told
+
+    def empty(self) -> tuple[Rows, Rows]:
+        """Nothing has come."""
+        return self.core.empty()
+
+    def sort(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
+        """Put what a neighbour said into the rows of the ends, as far as both know the same agents to be there; and what it said as a whole
+        where they agree on all."""
+        block, letter = told
+        place, row = self._places[neighbour], self._turn_of.get(neighbour)
+        same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
+        agrees = (place >= 0) & same
+        inbox.link[place[agrees]] = block[agrees, :-1]
+        arrived.link[place[agrees]] = True
+        if row is not None and same.all():
+            inbox.pair[row, : len(letter)] = letter
+            arrived.pair[row] = True
+
+    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, Look]:
+        """See `Embodied.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
+        done = guard.turn(self.core, state, inbox, arrived, moment)
+        for neighbour in done.refused:
+            self.log("refused", peer=neighbour)
+        if done.anew:
+            self.log("anew")
+        return done.state, done.outbox, done.look
+
+    def greet(self) -> None:
+        """Say that one is there."""
+        for neighbour in self._listeners():
+            self.peers.say(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
+
+    def say(self, arrays: Mapping[str, list[np.ndarray]], to: list[str] | None = None) -> None:
+        """Send the state to all neighbours that are there, or to some."""
+        for neighbour in self._listeners() if to is None else to:
+            self.peers.say(neighbour, Kind.STATE, arrays[neighbour])
+
+    def goodbye(self) -> None:
+        """Say that one stops; whoever leaves for good says so in its state before."""
+        for neighbour in self._listeners():
+            self.peers.say(neighbour, Kind.GOODBYE, [])
+
+    def _listeners(self) -> list[str]:
+        """The neighbours that are there, and those who are not, but speak: they may not know."""
+        now = self.clock()
+        return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
+
+    # -- time and place --------------------------------------------------------------------------------------------------------------------
+
+    def delays(self) -> np.ndarray:
+        """(E,) half the round trip to the neighbour of each end, s; 0 before it is known."""
+        trips = {neighbour: np.nan_to_num(peer.trip) for neighbour, peer in self.peers.all.items()}
+        return np.array([0.5 * trips[neighbour] for neighbour, _ in self.core.ends])
+
+    def fresh(self, within: float) -> np.ndarray:
+        """(E,) whether the neighbour of each end was heard within so many s."""
+        now = self.clock()
+        return np.array([now - self.peers.all[neighbour].heard <= within for neighbour, _ in self.core.ends], dtype=bool)
+
+    def place(self) -> np.ndarray:
+        """(d,) where the body is, NaN where that is not known."""
+        position = self.body.position()
+        if position is None or not self.body.sensed(self.clock()):
+            return np.full(self.part.team.dimension, np.nan)
+        return position
+
+    # -- the log ---------------------------------------------------------------------------------------------------------------------------
+
+    def log(self, event: str, **details: Any) -> None:
+        """One event."""
+        self._log({"event": event, "id": self.part.me, "t": self.clock(), **details})
+
+    def move(self, look: Look, stamp: float) -> None:
+        """Let the body follow the estimate, and tell what there is to tell.
+
+        Args:
+            look: of the last turn.
+            stamp: round or time, of the track.
+        """
+        self.target = look.x[self._me()]
+        self.body.follow(self.target, self.clock())
+        position = self.body.position()
+        if position is not None:
+            self._track.append([stamp, *position.tolist()])
+        self._look = look
+        self.conclude(stamp)
+        if self._period <= 0:
+            self.report()
+
+    def conclude(self, stamp: float, *, lately: bool = True) -> None:
+        """What the agent knows of the team, told if it is news; lately: whether it has heard of the others lately, without which it knows
+        nothing of where they are."""
+        look, before = self._look, (self._known, self._near)
+        self._known, self._near = None, False
+        if look is not None and lately and look.known > 0:
+            self._known = "satisfied"
+        elif look is not None and look.bound < 0:
+            self._known, self._near = "infeasible", lately and look.near
+        if before != (self._known, self._near):
+            if self._known is None:
+                self.log("unsatisfied" if before[0] == "satisfied" else "undecided", stamp=stamp)
+            elif self._known == "satisfied":
+                self.log("satisfied", stamp=stamp)
+            elif look is not None:
+                self.log("infeasible", stamp=stamp, near=self._near, bound=look.bound, margin=_number(look.least))
+
+    def _me(self) -> int:
+        """The agent's row among those who are there."""
+        return self.core.part.team.ids.index(self.part.me)
+
+    def watch(self) -> float:
+        """Log who went down or came up, and a report when one is due; when the next is."""
+        now = self.clock()
+        alive = self.peers.alive()
+        down = frozenset(
+            neighbour
+            for neighbour, peer in self.peers.all.items()
+            if neighbour not in self._gone and (now - peer.heard > SILENT or neighbour not in alive)
+        )
+        for neighbour in sorted(down ^ self._down):
+            if neighbour not in self._gone:
+                self.log("down" if neighbour in down else "up", peer=neighbour)
+        self._down = down
+        if self._period <= 0:
+            return now + SILENT
+        if now >= self._next_report:
+            self.report()
+            self._next_report = max(self._next_report + self._period, now)
+        return self._next_report
+
+    def report(self) -> None:
+        """How things stand, and where the body was since the last report.
+
+        `margin` is that of the agent at its `position`, and where it last heard that the others' bodies are; `estimate_margin` at its
+        estimates; `bound` is proven to be at least the best margin that the team can have.
+        """
+        look, position = self._look, self.body.position()
+        margin = estimate_margin = None
+        if look is not None:
+            estimate_margin = _number(self.core.margin(look.x))
+            if look.heard and position is not None:
+                bodies = look.bodies.copy()
+                bodies[self._me()] = position
+                margin = _number(self.core.margin(bodies))
+        peers = {}
+        for neighbour, peer in self.peers.all.items():
+            if neighbour not in self._gone:
+                trip = None if np.isnan(peer.trip) else round(peer.trip, 6)
+                peers[neighbour] = {
+                    "up": neighbour not in self._down, "silent": _number(round(self.clock() - peer.heard, 4)),
+                    "loss": round(peer.lost, 4), "trip": trip,
+                }  # fmt: skip
+        self.log(
+            "report",
+            position=None if position is None else position.tolist(),
+            margin=margin,
+            estimate_margin=estimate_margin,
+            known=None if look is None else look.known,
+            bound=None if look is None else _number(look.bound),
+            track=self._track,
+            peers=peers,
+            sent=dict(self.peers.sent),
+            dropped=self.peers.dropped,
+        )
+        self._track = []
+
+
+def _number(value: float) -> float | None:
+    """For JSON, which knows no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _expected(shares: int, largest: np.ndarray, letter: Numbers, frames: int, stamped: bool) -> Expected:
+    """What messages of a neighbour hold; the last number of each row tells who is there."""
+    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), letter]
+    return {
+        Kind.HELLO: [(shares,)],
+        Kind.STATE: [*frame * frames, *[(1,)] * stamped],
+        Kind.GOODBYE: [],
+    }

@@ -1,0 +1,187 @@
+"""The library kinds. Each is a pure function ψ and a factory that names its parameters; `KINDS` makes it known to scenario files.
+
+To add a kind, write the same two things and list the factory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from consat.problem.constraints.expression import Expression
+from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
+
+Other: TypeAlias = "str | int | Sequence[int] | Mapping[str, int] | np.ndarray"
+"""Whom a constraint reads besides its owner."""
+
+
+def _within(x: Array, *, center: Array, radius: Array) -> Array:
+    return radius**2 - jnp.sum((x - center) ** 2)
+
+
+def within(center: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Stay in a ball: ψ = r² − ‖x_i − c‖² (paper, case A). Strictly concave.
+
+    Args:
+        center: c, shape (d,), length.
+        radius: r > 0, length.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    return Constraint("within", _within, (OWNER,), {"center": Vector(center), "radius": Number(radius, positive=True)}, name, weight)
+
+
+def _outside(x: Array, *, center: Array, radius: Array) -> Array:
+    return jnp.sum((x - center) ** 2) - radius**2
+
+
+def outside(center: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Stay out of a ball: ψ = ‖x_i − c‖² − r². Not concave.
+
+    Args:
+        center: c, shape (d,), length.
+        radius: r > 0, length.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    return Constraint("outside", _outside, (OWNER,), {"center": Vector(center), "radius": Number(radius, positive=True)}, name, weight)
+
+
+def _near(x: Array, y: Array, *, radius: Array) -> Array:
+    return radius**2 - jnp.sum((x - y) ** 2)
+
+
+def near(agent: Other, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Stay near a teammate: ψ = r² − ‖x_i − x_j‖² (paper, case A). Concave.
+
+    Args:
+        agent: id of j; in a group also a relation, see `consat.problem.groups`.
+        radius: r > 0, length.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    return Constraint("near", _near, (OWNER, agent), {"radius": Number(radius, positive=True)}, name, weight)
+
+
+def _apart(x: Array, y: Array, *, radius: Array) -> Array:
+    return jnp.sum((x - y) ** 2) - radius**2
+
+
+def apart(agent: Other, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Keep a distance from a teammate: ψ = ‖x_i − x_j‖² − r² (paper, case E). Not concave.
+
+    Args:
+        agent: id of j; in a group also a relation, see `consat.problem.groups`.
+        radius: r > 0, length.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    return Constraint("apart", _apart, (OWNER, agent), {"radius": Number(radius, positive=True)}, name, weight)
+
+
+def _displacement(x: Array, y: Array, *, vector: Array, radius: Array) -> Array:
+    return radius**2 - jnp.sum((x - y - vector) ** 2)
+
+
+def displacement(agent: Other, vector: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Hold a place relative to a teammate: ψ = r² − ‖x_i − x_j − v‖². Concave.
+
+    Args:
+        agent: id of j; in a group also a relation, see `consat.problem.groups`.
+        vector: v, shape (d,), length: where i should be, seen from j.
+        radius: r > 0, length.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    parameters: dict[str, Parameter] = {"vector": Vector(vector), "radius": Number(radius, positive=True)}
+    return Constraint("displacement", _displacement, (OWNER, agent), parameters, name, weight)
+
+
+def _halfspace(x: Array, *, normal: Array, offset: Array) -> Array:
+    return offset - jnp.dot(normal, x)
+
+
+def halfspace(normal: ArrayLike, offset: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Stay on one side of a wall: ψ = b − n·x_i. Affine.
+
+    Args:
+        normal: n ≠ 0, shape (d,); points to the forbidden side.
+        offset: b, in the units of n·x.
+        name: what reports call it.
+        weight: positive factor on ψ.
+    """
+    return Constraint("halfspace", _halfspace, (OWNER,), {"normal": Vector(normal, nonzero=True), "offset": Number(offset)}, name, weight)
+
+
+def _above(x: Array, *, low: Array, axis: Array) -> Array:
+    return jnp.dot(axis, x - low)
+
+
+def _below(x: Array, *, high: Array, axis: Array) -> Array:
+    return jnp.dot(axis, high - x)
+
+
+def box(low: ArrayLike, high: ArrayLike, *, name: str | None = None, weight: float = 1.0) -> list[Constraint]:
+    """Stay in an axis-aligned box: on each axis k, ψ = x_ik − low_k and ψ = high_k − x_ik. Affine, 2d constraints.
+
+    Args:
+        low: shape (d,), length.
+        high: shape (d,), length, above `low` on every axis.
+        name: what reports call it; each side gets a suffix such as ``.low[0]``.
+        weight: positive factor on every ψ.
+    """
+    label = "box" if name is None else name
+    size = len(low) if isinstance(low, list | tuple) else np.size(low)
+    axes = np.eye(min(max(size, 1), 64))  # a size that is not the team's dimension is for the team to refuse
+    lows = [
+        Constraint("box", _above, (OWNER,), {"low": Vector(low), "axis": Fixed(axis)}, f"{label}.low[{k}]", weight)
+        for k, axis in enumerate(axes)
+    ]
+    highs = [
+        Constraint("box", _below, (OWNER,), {"high": Vector(high, above=low), "axis": Fixed(axis)}, f"{label}.high[{k}]", weight)
+        for k, axis in enumerate(axes)
+    ]
+    return lows + highs
+
+
+def expr(psi: str, *, name: str | None = None, weight: float = 1.0) -> Constraint:
+    """Any differentiable ψ as text, e.g. ``"2**2 - norm2(a2 - a3)"``; the agents involved are read off it.
+
+    Args:
+        psi: the expression; see `consat.problem.constraints.expression` for the language. It must read its owner's position.
+        name: what reports call it.
+        weight: positive factor on ψ.
+
+    Raises:
+        InvalidExpression: the text is not in the language; says where and what would be.
+    """
+    parsed = Expression.parse(psi)
+    return Constraint("expr", parsed.function, parsed.reads, {"numbers": Fixed(parsed.numbers)}, name, weight, psi)
+
+
+def constraint(
+    psi: Callable[..., Any], reads: Sequence[str], *, name: str | None = None, weight: float = 1.0, **parameters: ArrayLike
+) -> Constraint:
+    """Your own ψ as a Python function of positions, traced by JAX: no gradient to write, nothing else to declare.
+
+    Args:
+        psi: ``psi(*positions, **parameters) -> scalar``, written with `jax.numpy`; each position is a (d,) array.
+            Constraints that share one function are evaluated together, so define it once and vary `parameters`.
+        reads: the agents whose positions `psi` takes, in that order; the owner among them.
+        name: what reports call it.
+        weight: positive factor on ψ.
+        parameters: arrays that `psi` takes by keyword.
+    """
+    kind = getattr(psi, "__name__", "constraint").strip("<>")
+    return Constraint(kind, psi, tuple(reads), {key: Fixed(value) for key, value in parameters.items()}, name, weight)
+
+
+KINDS: Final[Mapping[str, Callable[..., Constraint | list[Constraint]]]] = {
+    factory.__name__: factory for factory in (within, outside, near, apart, displacement, halfspace, box, expr)
+}
+"""What ``kind:`` may say in a scenario file; the keys of a constraint there are the arguments of its factory."""

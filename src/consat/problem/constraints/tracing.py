@@ -1,0 +1,190 @@
+"""Traces read as functions of the positions: `interpret` walks a jaxpr, `describe` knows what each primitive does to a `Node`.
+
+A primitive without a rule yields an unknown function, never a guess.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+from numpy.typing import NDArray
+
+from consat.problem.constraints.atoms import ATOMS
+from consat.problem.constraints.composition import arranged, atom, dot, fold, larger, minus, negative, plus, power, raised, smaller, times
+from consat.problem.constraints.node import Node, constant, unknown
+
+Array = NDArray[Any]
+T = TypeVar("T")
+
+CALLS: Final = frozenset({"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"})
+"""Primitives whose value is that of the jaxpr they carry."""
+
+
+def interpret(
+    closed: core.ClosedJaxpr,
+    arguments: Sequence[T],
+    constant: Callable[[Any], T],
+    step: Callable[[core.JaxprEqn, Sequence[T]], Sequence[T] | None],
+) -> list[T]:
+    """Evaluate a jaxpr on values of any kind.
+
+    Args:
+        closed: the jaxpr.
+        arguments: what stands for its inputs.
+        constant: makes such a value of a number or array.
+        step: evaluates one equation, or answers None to one of `CALLS`, whose body is then entered.
+    """
+    env: dict[Any, T] = dict(zip(closed.jaxpr.invars, arguments, strict=True))
+    env.update(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
+
+    def read(atom: Any) -> T:
+        return constant(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if isinstance(atom, core.Literal) else env[atom]
+
+    for eqn in closed.jaxpr.eqns:
+        inputs = [read(atom) for atom in eqn.invars]
+        outputs = step(eqn, inputs)
+        env.update(zip(eqn.outvars, interpret(body(eqn), inputs, constant, step) if outputs is None else outputs, strict=True))
+    return [read(atom) for atom in closed.jaxpr.outvars]
+
+
+def body(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
+    """The jaxpr that one of `CALLS` carries."""
+    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
+    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+
+
+def evaluate(eqn: core.JaxprEqn, *inputs: Any) -> list[Any]:
+    """One equation, not of `CALLS`, on arrays."""
+    out = eqn.primitive.bind(*inputs, **eqn.params)
+    return list(out) if eqn.primitive.multiple_results else [out]
+
+
+Rule = Callable[..., Node]
+
+RULES: Final[Mapping[str, Rule]] = {
+    "add": lambda a, b, **_: plus(a, b),
+    "add_any": lambda a, b, **_: plus(a, b),
+    "sub": lambda a, b, **_: minus(a, b),
+    "neg": lambda a, **_: negative(a),
+    "mul": lambda a, b, **_: times(a, b),
+    "div": lambda a, b, **_: times(a, power(b, np.array(-1.0))),
+    "max": lambda a, b, **_: larger(a, b),
+    "min": lambda a, b, **_: smaller(a, b),
+    "clamp": lambda low, a, high, **_: smaller(larger(a, low), high),
+    "square": lambda a, **_: power(a, np.array(2.0)),
+    "integer_pow": lambda a, *, y, **_: power(a, np.array(float(y))),
+    "rsqrt": lambda a, **_: power(a, np.array(-0.5)),
+    "pow": lambda a, b, **_: raised(a, b),
+    "reduce_sum": lambda a, *, axes, **_: fold(plus, a, axes),
+    "reduce_prod": lambda a, *, axes, **_: fold(times, a, axes),
+    "reduce_max": lambda a, *, axes, **_: fold(larger, a, axes),
+    "reduce_min": lambda a, *, axes, **_: fold(smaller, a, axes),
+    "dot_general": lambda a, b, *, dimension_numbers, **_: dot(a, b, dimension_numbers),
+    "logaddexp": lambda a, b: atom("log", plus(atom("exp", a), atom("exp", b))),
+    **{name: (lambda a, name=name, **_: atom(name, a)) for name in ATOMS},
+}
+"""What a primitive does to nodes. One that is missing makes an unknown function."""
+
+MOVERS: Final[Mapping[str, Callable[..., Any] | None]] = {
+    "copy": lambda _into, a, **_: a,
+    "convert_element_type": lambda _into, a, **_: a,
+    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), lambda into, a, **_: a.reshape(into)),
+    "broadcast_in_dim": lambda into, a, *, broadcast_dimensions, **_: np.broadcast_to(
+        a.reshape([dict(zip(broadcast_dimensions, a.shape, strict=True)).get(axis, 1) for axis in range(len(into))]), into
+    ),
+    "transpose": lambda _into, a, *, permutation, **_: a.transpose(permutation),
+    "rev": lambda _into, a, *, dimensions, **_: np.flip(a, dimensions),
+    "slice": lambda _into, a, *, start_indices, limit_indices, strides, **_: a[
+        tuple(map(slice, start_indices, limit_indices, strides or (1,) * a.ndim))
+    ],
+    "split": lambda _into, a, *, sizes, axis, **_: np.split(a, np.cumsum(sizes)[:-1], axis),
+    "concatenate": lambda _into, *parts, dimension, **_: np.concatenate(parts, dimension),
+    "stack": lambda _into, *parts, axis, **_: np.stack(parts, axis),
+    "select_n": lambda _into, which, *cases, **_: np.choose(which.astype(int), cases),
+    **dict.fromkeys(("pad", "gather", "dynamic_slice", "dynamic_update_slice", "scatter"), None),
+}
+"""Primitives that only rearrange entries, as they act on entry numbers; None: let JAX do it."""
+
+SELECTORS: Final[Mapping[str, slice]] = {
+    "select_n": slice(0, 1),
+    "gather": slice(1, 2),
+    "dynamic_slice": slice(1, None),
+    "dynamic_update_slice": slice(2, None),
+    "scatter": slice(1, 2),
+}
+"""Which operands of those say where entries go; they must be known, and the same for all members."""
+
+
+def _avals(variables: Sequence[Any]) -> list[Any]:
+    """Their shapes and types."""
+    return [variable.aval for variable in variables]
+
+
+def describe(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> Sequence[Node] | None:
+    """The step of `interpret` for nodes: what the outputs of an equation are, given what its inputs are."""
+    name, outputs = eqn.primitive.name, _avals(eqn.outvars)
+    if name in CALLS:
+        return [RULES["logaddexp"](*inputs)] if _is_logaddexp(eqn) else None
+    if all(math.prod(each.shape) for each in (*inputs, *outputs)):
+        if name in RULES and np.issubdtype(outputs[0].dtype, np.floating):
+            node = RULES[name](*inputs, **eqn.params)
+            return [
+                node if node.shape == outputs[0].shape else arranged([node], np.arange(math.prod(node.shape)).reshape(outputs[0].shape))
+            ]
+        moved = _moved(eqn, inputs) if name in MOVERS else None
+        if moved is not None:
+            return moved
+    values = [node.value for node in inputs if node.value is not None]
+    if len(values) == len(inputs):
+        return [constant(value) for value in _evaluated(eqn, values)]
+    return [unknown(each.shape, 0 if all(node.degree == 0 for node in inputs) else None) for each in outputs]
+
+
+def _is_logaddexp(eqn: core.JaxprEqn) -> bool:
+    """Whether a call is `jax.numpy.logaddexp`, by what it does, not by its name."""
+    if eqn.primitive.name != "custom_jvp_call" or len(eqn.invars) != 2:
+        return False
+    operands = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in _avals(eqn.invars)]
+    (reference,) = jax.make_jaxpr(jnp.logaddexp)(*operands).eqns
+    return str(body(reference)) == str(body(eqn))
+
+
+def _moved(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> list[Node] | None:
+    """What a primitive that rearranges entries does, found by letting it rearrange their numbers."""
+    name, outputs = eqn.primitive.name, _avals(eqn.outvars)
+    if not np.issubdtype(outputs[0].dtype, np.floating):
+        return None
+    selectors = range(len(inputs))[SELECTORS.get(name, slice(0))]
+    entries = [node for k, node in enumerate(inputs) if k not in selectors]
+    numbers = iter(
+        np.split(np.arange(total := sum(math.prod(node.shape) for node in entries)), np.cumsum([math.prod(n.shape) for n in entries]))
+    )
+    operands = []
+    for k, (node, aval) in enumerate(zip(inputs, _avals(eqn.invars), strict=True)):
+        if k not in selectors:
+            operands.append(next(numbers).reshape(node.shape))
+        elif node.value is not None and len(node.value) == 1:
+            operands.append(np.broadcast_to(node.value[0], node.shape).astype(aval.dtype))
+        else:
+            return None
+    act = MOVERS[name]
+    moved = evaluate(eqn, *operands) if act is None else act(outputs[0].shape, *operands, **eqn.params)
+    indices = [np.asarray(index) for index in (moved if isinstance(moved, list) else [moved])]
+    inside = all(np.all((index >= 0) & (index < total)) for index in indices)  # out of bounds, a gather fills
+    return [arranged(entries, index) for index in indices] if inside else None
+
+
+def _evaluated(eqn: core.JaxprEqn, values: Sequence[Array]) -> list[Array]:
+    """A primitive applied to known constants."""
+    typed = [np.broadcast_to(v, (len(v), *aval.shape)).astype(aval.dtype) for v, aval in zip(values, _avals(eqn.invars), strict=True)]
+    if all(len(value) == 1 for value in typed):
+        return [np.asarray(out)[None] for out in evaluate(eqn, *(value[0] for value in typed))]
+    shared = [None if len(value) == 1 else 0 for value in typed]
+    return list(map(np.asarray, jax.vmap(partial(evaluate, eqn), shared)(*(value[0] if len(value) == 1 else value for value in typed))))

@@ -1,0 +1,118 @@
+"""Constraints on their way into families: what is wrong with a ψ shows before anything runs, and those that are alike come together."""
+
+from __future__ import annotations
+
+import functools
+import types
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from consat.errors import Fault, InvalidExpression
+from consat.numerics import float64
+from consat.problem.constraints.record import Constraint
+from consat.problem.family import Part
+from consat.problem.parameters import Path
+
+SUGGESTIONS = 20
+"""Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
+
+
+@dataclass
+class Entry:
+    """One constraint on its way into a family."""
+
+    constraint: Constraint
+    owner: int
+    agents: tuple[int, ...]
+    name: str
+    path: Path
+    where: str
+    values: dict[str, np.ndarray] = field(default_factory=dict)
+    weight: float = 1.0
+
+    @property
+    def family(self) -> tuple[Any, ...]:
+        """What those of one family have in common."""
+        shapes = tuple((key, value.shape) for key, value in sorted(self.values.items()))
+        return same(self.constraint.psi), len(self.agents), shapes
+
+
+def same(psi: Callable[..., Any]) -> Hashable:
+    """What two functions have in common that compute the same: the same code over the same variables. A lambda written in a loop is
+    another object each time, yet one function; constraints that share it are one family. Valid while both functions live."""
+    if not isinstance(psi, types.FunctionType):
+        return psi
+    bound = [psi.__globals__, *(psi.__closure__ or ()), *(psi.__defaults__ or ()), *(psi.__kwdefaults__ or {}).values()]
+    return psi.__code__, tuple(map(id, bound)), psi.__name__
+
+
+@float64
+def trace(entries: Iterable[Entry], dimension: int, faults: list[Fault]) -> None:
+    """Trace ψ once a family: whatever a user's function does wrong shows here, before anything runs."""
+    seen: dict[tuple[Any, ...], Fault | None] = {}
+    for entry in entries:
+        first = entry.family not in seen
+        fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
+        if fault is not None and not first:
+            written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
+            # Equal expressions may be written differently: each has its own columns.
+            again = _untraceable(entry, dimension) if written else None
+            fault = again or replace(fault, path=(*entry.path, *fault.path[len(entry.path) :]), where=entry.where, offset=0)
+        if fault is not None:
+            faults.append(fault)
+
+
+def _untraceable(entry: Entry, dimension: int) -> Fault | None:
+    message, offset = _mistake(entry, dimension)
+    key: Path = ("psi",) if entry.constraint.source is not None else ()
+    return Fault((*entry.path, *key), message, entry.where, offset) if message else None
+
+
+def _mistake(entry: Entry, dimension: int) -> tuple[str, int]:
+    """What is wrong with ψ, and where in its text; an empty message if nothing is."""
+    position = jax.ShapeDtypeStruct((dimension,), np.dtype(float))
+    try:
+        shape = jax.eval_shape(functools.partial(entry.constraint.psi, **entry.values), *(position,) * len(entry.agents))
+    except InvalidExpression as error:
+        return error.message, error.column
+    except Exception as error:  # noqa: BLE001 - whatever the user's own function raises is a fault of the input
+        reason = str(error).strip().split("\n")[0]
+        return f"ψ cannot be traced by JAX in dimension {dimension}: {reason or type(error).__name__}", 0
+    leaves = jax.tree.leaves(shape)
+    if len(leaves) != 1 or leaves[0].shape != ():
+        return f"ψ must return one number, but returns {', '.join(f'shape {leaf.shape}' for leaf in leaves) or 'nothing'}", 0
+    if not np.issubdtype(leaves[0].dtype, np.floating):
+        return f"ψ must return a real number, but returns {leaves[0].dtype}; constraints must be differentiable", 0
+    return "", 0
+
+
+def alike(entries: Sequence[Entry]) -> list[Part]:
+    """Constraints that share a family, together."""
+    members: dict[tuple[Any, ...], list[Entry]] = {}
+    turns: dict[tuple[Any, ...], list[int]] = {}
+    for turn, entry in enumerate(entries):
+        members.setdefault(entry.family, []).append(entry)
+        turns.setdefault(entry.family, []).append(turn)
+    return [
+        Part(
+            kind=group[0].constraint.kind,
+            psi=group[0].constraint.psi,
+            agents=np.array([entry.agents for entry in group], dtype=np.int32),
+            owner=np.array([entry.owner for entry in group], dtype=np.int32),
+            parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
+            weight=np.array([entry.weight for entry in group]),
+            names=tuple(entry.name for entry in group),
+            sources=_sources(group),
+            turn=np.array(turns[family]),
+        )
+        for family, group in members.items()
+    ]
+
+
+def _sources(entries: Sequence[Entry]) -> tuple[str, ...] | None:
+    texts = tuple(entry.constraint.source for entry in entries if entry.constraint.source is not None)
+    return texts if len(texts) == len(entries) else None

@@ -1,0 +1,283 @@
+"""Task graph, clusters and communication graph (paper, section IV-A), and who must hold whose position (design, local estimates).
+
+Everything works on arrays of edges; `task_graph` and `communication_graph` give the same as networkx graphs over ids.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from consat.errors import Fault, InvalidTeam
+from consat.problem.family import distinct
+from consat.problem.team import Team
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+
+def task_edges(team: Team) -> np.ndarray:
+    """Edges (i, j) of the task graph: some ψ of i reads x_j; (i, i) where some ψ of i reads x_i alone.
+
+    Returns:
+        (E, 2) int32, sorted, each edge once.
+    """
+    return _unique_pairs(_reads(team), team.count)
+
+
+def _reads(team: Team) -> np.ndarray:
+    """The edges of the task graph, in any order and as often as there are constraints for them; (E', 2) int32."""
+    edges = [np.zeros((0, 2), dtype=np.int32)]
+    for family in team.families:
+        for slot in range(family.arity):
+            pairs = np.stack([family.owner, family.agents[:, slot]], axis=1)
+            edges.append(pairs if family.arity == 1 else pairs[pairs[:, 0] != pairs[:, 1]])
+    return np.concatenate(edges)
+
+
+def clusters(team: Team) -> np.ndarray:
+    """The maximal dependency cluster of each agent: the weakly connected components of the task graph.
+
+    Returns:
+        (N,) int32 labels from 0, in the order of their first agents.
+    """
+    return _components(_reads(team), team.count)
+
+
+def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
+    """The links inside a cluster; (L', 2) int32."""
+    return team.links[cluster[team.links[:, 0]] == cluster[team.links[:, 1]]]
+
+
+def disconnected(team: Team) -> list[list[list[str]]]:
+    """The clusters whose agents cannot reach one another (Assumption 1): neither over the links inside them nor through `relays`.
+
+    Returns:
+        for each such cluster its parts, connected by links inside it, each a list of ids.
+    """
+    cluster = clusters(team)
+    part, broken = _broken(team, cluster)
+    joined = relays(team, cluster)
+    parts = [
+        [np.flatnonzero((cluster == c) & (part == p)) for p in np.unique(part[cluster == c])] for c in broken.tolist() if c not in joined
+    ]
+    return [[[team.ids[int(i)] for i in members] for members in of_cluster] for of_cluster in parts]
+
+
+def _broken(team: Team, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) which agents reach one another over links inside their cluster, and the clusters that fall into several such parts."""
+    part = _components(cluster_links(team, cluster), team.count)
+    first = np.full(cluster.max() + 1, -1)
+    first[cluster[::-1]] = part[::-1]
+    return part, np.unique(cluster[part != first[cluster]])
+
+
+def relays(team: Team, cluster: np.ndarray) -> dict[int, set[int]]:
+    """Who passes messages between the parts of a cluster that the links inside it leave in pieces.
+
+    Only agents that no constraint has to do with, neither as its owner nor as one that it reads, stand in for a cluster that is not their
+    own: they hold copies of its positions, and add nothing.
+
+    Args:
+        team: the team.
+        cluster: (N,) as `clusters` returns.
+
+    Returns:
+        for each cluster that such agents join, the agents: few, though not always the fewest.
+    """
+    _, broken = _broken(team, cluster)
+    free = (np.bincount(cluster)[cluster] == 1) & (team.constraints_per_agent == 0)
+    if not len(broken) or not free.any():
+        return {}
+    found = {}
+    for c in broken.tolist():
+        allowed = (cluster == c) | free
+        links = team.links[allowed[team.links].all(axis=1)]
+        members = np.flatnonzero(cluster == c)
+        if len(np.unique(_components(links, team.count)[members])) == 1:
+            found[c] = _steiner(int(members[0]), set(members[1:].tolist()), _adjacency(links, team.count))
+    return found
+
+
+def require_connected(team: Team) -> None:
+    """Raises: InvalidTeam: where a cluster is not connected by links, naming its parts and a link that would join them."""
+    faults = []
+    for parts in disconnected(team):
+        shown = " and ".join("{" + ", ".join(part[:5]) + (", …" if len(part) > 5 else "") + "}" for part in parts[:4])
+        cure = f"add a link such as [{parts[0][0]}, {parts[1][0]}]"
+        message = f"the constraints tie {shown} together, but no path of links inside their cluster joins them (Assumption 1), "
+        message += f"nor one over agents without constraints; {cure}"
+        faults.append(Fault(("communication",), message, "communication"))
+    if faults:
+        raise InvalidTeam(faults)
+
+
+def hops(count: int, links: np.ndarray) -> int:
+    """How many links a message crosses, at most, between two agents of a component: found by searching from an agent far out, and then from
+    the one farthest from it, which is exact on trees and close elsewhere.
+
+    Args:
+        count: N.
+        links: (L, 2).
+    """
+    labels = _components(links, count)
+    starts = np.unique(labels, return_index=True)[1]
+    longest = 0
+    for _ in range(2):
+        depth, order = _depths(links, count, starts)
+        longest = max(longest, int(depth.max(initial=0)))
+        starts = np.zeros(len(starts), dtype=np.intp)
+        starts[labels[order]] = order  # the last one stays: the deepest of its component
+    return longest
+
+
+def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many links each agent, in the order of a breadth-first search, is from the start in its component; and that order."""
+    # one search from all starts, as if they hung on one more agent
+    here = np.concatenate([links[:, 0], links[:, 1], np.full(len(starts), count, dtype=links.dtype)])
+    there = np.concatenate([links[:, 1], links[:, 0], starts.astype(links.dtype)])
+    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(count + 1, count + 1)).tocsr()
+    order, parent = breadth_first_order(graph, count, directed=True)
+    place = np.empty(count + 1, dtype=np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    above = place[np.maximum(parent[order], 0)]
+    above[0] = 0
+    depth = np.ones(len(order), dtype=np.int32)
+    depth[0] = 0
+    while above.any():  # twice as far up each time, so that a chain of a million takes twenty turns
+        depth += depth[above]
+        above = above[above]
+    return depth[1:] - 1, order[1:]
+
+
+def middles(count: int, links: np.ndarray) -> np.ndarray:
+    """(K,) for each component an agent from which no other is far: the middle of a longest path; exact on trees and close elsewhere.
+
+    Args:
+        count: N.
+        links: (L, 2).
+    """
+    labels = _components(links, count)
+    starts, far = np.unique(labels, return_index=True)[1], np.zeros(count, dtype=np.int64)
+    for turn in range(3):
+        depth, order = _depths(links, count, starts)
+        if turn:
+            far[order] = np.maximum(far[order], depth)
+        starts = np.zeros(len(starts), dtype=np.intp)
+        starts[labels[order]] = order  # the last one stays: the deepest of its component
+    order = np.lexsort((np.arange(count), far, labels))
+    return order[np.unique(labels[order], return_index=True)[1]]
+
+
+def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
+    """Who holds a copy of whose position under local estimates: i holds x_j if some ψ of i reads x_j, j holds its own, and relays
+    hold it where the links among these alone would leave them in pieces: agents of the same cluster or, where that has none, `relays`.
+
+    Args:
+        team: whose clusters are connected.
+        cluster: (N,) as `clusters` returns.
+
+    Returns:
+        (C, 2) int32 pairs (holder, position), sorted, each once.
+    """
+    own = np.arange(team.count, dtype=np.int32)
+    pairs = _unique_pairs(np.concatenate([_reads(team), np.stack([own, own], axis=1)]), team.count)
+    further = list(_further(team, cluster, pairs))
+    return _unique_pairs(np.concatenate([pairs, *further]), team.count) if further else pairs
+
+
+def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.ndarray]:
+    """Extra (holder, position) pairs. Positions whose readers are all linked to their owner need none, and cost no loop."""
+    count, links = team.count, cluster_links(team, cluster)
+    foreign = pairs[pairs[:, 0] != pairs[:, 1]]
+    known = _keys(links, count)  # sorted, as links are
+    wanted = _keys(np.stack([foreign.min(axis=1), foreign.max(axis=1)], axis=1), count)
+    linked = np.append(known, -1)[np.searchsorted(known, wanted)] == wanted
+    remote = np.unique(foreign[~linked, 1])
+    if not len(remote):
+        return
+    inside, outside = _adjacency(links, count), relays(team, cluster)
+    around = {c: _adjacency(_among(team, cluster, c, joining), count) for c, joining in outside.items()}
+    by_position = foreign[np.argsort(foreign[:, 1], kind="stable")]
+    starts = np.searchsorted(by_position[:, 1], remote), np.searchsorted(by_position[:, 1], remote, side="right")
+    for position, begin, end in zip(remote, *starts, strict=True):
+        neighbours = around.get(int(cluster[position]), inside)
+        path_holders = _steiner(int(position), set(map(int, by_position[begin:end, 0])), neighbours)
+        yield np.array([(holder, position) for holder in path_holders], dtype=np.int32).reshape(-1, 2)
+
+
+def _among(team: Team, cluster: np.ndarray, c: int, joining: set[int]) -> np.ndarray:
+    """The links among the agents of a cluster and those that join its parts."""
+    allowed = cluster == c
+    allowed[list(joining)] = True
+    return team.links[allowed[team.links].all(axis=1)]
+
+
+def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> set[int]:
+    """Agents to add so that `root` and `wanted` are connected: again and again the shortest path from what is joined to the nearest
+    that is not (Takahashi, Matsuyama 1980; at most twice the shortest tree)."""
+    joined, added, missing = {root}, set[int](), set(wanted)
+    while missing:
+        parent: dict[int, int] = dict.fromkeys(joined, -1)
+        queue = deque(sorted(joined))
+        while queue:
+            agent = queue.popleft()
+            if agent in missing:
+                break
+            for other in map(int, neighbours[agent]):
+                if other not in parent:
+                    parent[other] = agent
+                    queue.append(other)
+        while agent not in joined:
+            joined.add(agent)
+            missing.discard(agent)
+            if agent not in wanted:
+                added.add(agent)
+            agent = parent[agent]
+    return added
+
+
+def task_graph(team: Team) -> nx.DiGraph:
+    """The task graph over ids, with self-edges."""
+    import networkx as nx
+
+    graph = nx.DiGraph()
+    graph.add_nodes_from(team.ids)
+    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in task_edges(team))
+    return graph
+
+
+def communication_graph(team: Team) -> nx.Graph:
+    """The communication graph over ids."""
+    import networkx as nx
+
+    graph = nx.Graph()
+    graph.add_nodes_from(team.ids)
+    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in team.links)
+    return graph
+
+
+def _keys(pairs: np.ndarray, count: int) -> np.ndarray:
+    return pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+
+
+def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    keys = distinct(_keys(pairs, count))
+    return np.stack([keys // count, keys % count], axis=1).astype(np.int32)
+
+
+def _components(edges: np.ndarray, count: int) -> np.ndarray:
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    labels: np.ndarray = connected_components(graph, directed=False)[1]
+    return labels.astype(np.int32)
+
+
+def _adjacency(links: np.ndarray, count: int) -> list[np.ndarray]:
+    both = np.concatenate([links, links[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    return np.split(both[:, 1], np.searchsorted(both[:, 0], np.arange(1, count)))

@@ -1,0 +1,438 @@
+"""Groups: many agents alike, with constraints that refer to one another by relation rather than by name.
+
+A member is known by its place in the group, from 0; its id is the group's name and that place + 1. What a constraint says of the agent it
+reads may be
+
+* a text: that agent of the team, the same for all members;
+* a whole number: so many places further along the group, ``-1`` being the one ahead; round the end, if the group is a ring;
+* a list of them, one an axis: so many steps along each axis of a grid;
+* ``{"nearest": k}``: the k members whose places are nearest, a constraint for each;
+* an array of whole numbers: the members at these places, one for each constraint.
+
+Members to whom such a relation leads nowhere (the first has nobody ahead) go without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from consat.errors import Fault, closest, shown
+from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
+from consat.problem.family import Counted, Derived, Part, Repeated
+from consat.problem.parameters import LARGEST, Path, checked, checked_rows, is_number
+
+Ints = NDArray[np.int64]
+
+SHAPES = ("line", "ring", "grid", "random")
+OTHER = "other"
+"""In a group's expression: the agent that ``agent`` tells of."""
+SELF = "self"
+"""In a group's expression: the member itself."""
+PLACE = "place"
+"""As a centre: the member's own place; as a displacement: as its place lies to the other's."""
+MOST = 2**27
+"""Members at most; copies and links are counted by int32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Each:
+    """A constraint of a group, and who has it; see `each`."""
+
+    constraint: Any
+    of: Any = None
+    agent: Any = None
+
+
+def each(constraint: Any, *, of: Any = None, agent: Any = None) -> Each:
+    """A constraint for some members of a group.
+
+    Args:
+        constraint: what `consat.within` and its like return. A parameter may be an array with one value for each member that has the
+            constraint, and a centre or displacement may be ``"place"``.
+        of: who has it: ``"first"``, ``"last"``, an id, a list of ids, ``{"every": k}`` (every k-th, on a grid along every axis), or an
+            array of places in the group; all, if None.
+        agent: for an expression, whom ``other`` means in it; see `consat.problem.groups`. ``self`` is the member.
+    """
+    return Each(constraint, of, agent)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Many agents alike: `count` of them, called name1, name2, …
+
+    Attributes:
+        name: what their ids begin with.
+        count: how many.
+        constraints: of every member; `each` gives one to some of them.
+        shape: how their places lie: on a ``line`` or ``ring``, on a square ``grid``, or at ``random`` with one place to each
+            spacing^d; around the origin.
+        spacing: between neighbouring places, length.
+        scatter: how far from its place a member starts on each axis, at most, length; None: starts know nothing of places.
+        start: (count, d) where they start instead.
+        seed: of random places.
+    """
+
+    name: str
+    count: int
+    constraints: Sequence[Any] = ()
+    shape: str = "line"
+    spacing: float = 1.0
+    scatter: float | None = None
+    start: ArrayLike | None = None
+    seed: int = 0
+
+
+class Layout(NamedTuple):
+    """The places of a group.
+
+    Attributes:
+        places: (N, d).
+        steps: (N, d) the coordinates of each member on the grid; (N, 1) its place along a line.
+        sides: how far these go on each axis.
+        ring: whether the last is followed by the first.
+    """
+
+    places: NDArray[np.floating]
+    steps: Ints
+    sides: tuple[int, ...]
+    ring: bool
+
+
+def layout(group: Group, dimension: int) -> Layout:
+    """Where the members of a group that has no faults belong."""
+    count, along = group.count, np.arange(group.count)
+    places = np.zeros((count, dimension))
+    if group.shape == "grid":
+        side = next(n for n in range(max(round(count ** (1 / dimension)) - 1, 1), count + 1) if n**dimension >= count)
+        steps = np.stack(np.unravel_index(along, (side,) * dimension), axis=1)
+        return Layout(group.spacing * (steps - 0.5 * (side - 1)), steps, (side,) * dimension, ring=False)
+    if group.shape == "random":
+        side = group.spacing * count ** (1 / dimension)
+        places = side * (np.random.default_rng(group.seed).random((count, dimension)) - 0.5)
+        places = places[np.argsort(_along_a_curve(places), kind="stable")]
+    elif group.shape == "ring" and dimension > 1:
+        angle = 2 * np.pi * along / count
+        places[:, :2] = np.stack([np.cos(angle), np.sin(angle)], axis=1) * group.spacing / max(2 * np.sin(np.pi / max(count, 2)), 1e-9)
+    else:
+        places[:, 0] = group.spacing * (along - 0.5 * (count - 1))
+    return Layout(places, along[:, None], (count,), group.shape == "ring")
+
+
+def _along_a_curve(places: NDArray[np.float64]) -> Ints:
+    """(N,) where places come along a Morton curve, so that neighbours in space are neighbours in memory, too."""
+    dimension = places.shape[1]
+    bits = min(20, 62 // dimension)
+    low, high = places.min(axis=0), places.max(axis=0)
+    cells = ((places - low) / np.maximum(high - low, 1e-300) * (2**bits - 1)).astype(np.int64)
+    code = np.zeros(len(places), dtype=np.int64)
+    for bit in range(bits):
+        for axis in range(dimension):
+            code |= ((cells[:, axis] >> bit) & 1) << (bit * dimension + axis)
+    return code
+
+
+def faults_of(group: Group, path: Path, dimension: int) -> list[Fault]:
+    """What is wrong with a group, but for its constraints."""
+    where = _who(group)
+    wrong: list[tuple[str, str]] = []
+    if not isinstance(group.name, str) or not group.name.strip() or not group.name.isprintable():
+        wrong.append(("group", f"group is {shown(group.name)}, but must be a printable text such as a, which gives a1, a2, …"))
+    if isinstance(group.count, bool) or not isinstance(group.count, int | np.integer) or not 1 <= group.count <= MOST:
+        wrong.append(("count", f"count is {shown(group.count)}, but must be a whole number from 1 to {MOST}"))
+    if group.shape not in SHAPES:
+        wrong.append(("shape", f"there is no shape {shown(group.shape)}; the shapes are {', '.join(SHAPES)}{closest(group.shape, SHAPES)}"))
+    distances: list[tuple[str, Any, float]] = [("spacing", group.spacing, 1 / LARGEST), ("scatter", group.scatter, 0.0)]
+    for key, value, low in distances:
+        if (value is not None or key == "spacing") and not (is_number(value) and low <= value <= LARGEST):
+            wrong.append((key, f"{key} is {shown(value)}, but must be a {'positive ' if low else ''}number{'' if low else ' ≥ 0'}"))
+    if isinstance(group.seed, bool) or not isinstance(group.seed, int | np.integer) or not 0 <= group.seed < 2**63:
+        wrong.append(("seed", f"seed is {shown(group.seed)}, but must be a whole number from 0 to 2^63 - 1"))
+    if group.start is not None and not any(key == "count" for key, _ in wrong):
+        start = np.asarray(group.start)
+        if start.shape != (group.count, dimension) or start.dtype.kind not in "iuf" or not (np.abs(start) <= LARGEST).all():
+            wrong.append(("start", f"start must be finite numbers of shape {(group.count, dimension)}, a row for each member"))
+    return [Fault((*path, key), message, where) for key, message in wrong]
+
+
+def _who(group: Group) -> str:
+    return f"group {group.name!r}"
+
+
+@dataclass
+class Expansion:
+    """A group becoming arrays.
+
+    Attributes:
+        group: without faults of its own.
+        first: where its members begin in the team.
+        ids: of the team.
+        find: the place in the team of an id, or None.
+        dimension: d.
+        path: of the group.
+        faults: what is found wrong.
+        layout: its places.
+    """
+
+    group: Group
+    first: int
+    ids: Sequence[str]
+    find: Any
+    dimension: int
+    path: Path
+    faults: list[Fault]
+    layout: Layout = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.layout = layout(self.group, self.dimension)
+
+    def parts(self) -> list[tuple[Part, Constraint, Path, str]]:
+        """The constraints of all members, and what each is made from, for faults to name."""
+        made: list[tuple[Part, Constraint, Path, str]] = []
+        named: dict[str, Path] = {}
+        for path, entry in self.entries():
+            constraint = entry.constraint
+            where = f"{_who(self.group)}, constraint {constraint.name or constraint.kind!r}"
+            if constraint.name is not None and not self.good_name(constraint.name, named, path, where):
+                continue
+            part = self.part(entry, path, where)
+            if part is not None:
+                made.append((part, constraint, path, where))
+        return self.told_apart(made)
+
+    def entries(self) -> Iterator[tuple[Path, Each]]:
+        for k, item in enumerate(self.group.constraints):
+            path = (*self.path, "constraints", k)
+            outer = item if isinstance(item, Each) else Each(item)
+            for constraint in flatten(outer.constraint):
+                if isinstance(constraint, Constraint):
+                    yield path, replace(outer, constraint=constraint)
+                elif isinstance(constraint, Each):
+                    yield path, constraint
+                else:
+                    message = f"{constraint!r} is no constraint; use consat.within and its like"
+                    self.faults.append(Fault(path, message, _who(self.group)))
+
+    def good_name(self, name: Any, named: dict[str, Path], path: Path, where: str) -> bool:
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            self.faults.append(Fault((*path, "name"), f"name is {shown(name)}, but must be a printable text", where))
+        elif name in named:
+            message = f"name {name!r} is taken by another constraint of {_who(self.group)}; choose another"
+            self.faults.append(Fault((*path, "name"), message, where))
+        else:
+            named[name] = path
+            return True
+        return False
+
+    def part(self, entry: Each, path: Path, where: str) -> Part | None:
+        constraint, known = entry.constraint, len(self.faults)
+        rows = self.members(entry.of, path, where)
+        slots = self.slots(constraint, entry.agent, path, where)
+        if len(self.faults) > known:
+            return None
+        row, other = self.related(slots.relation, rows, path, where)
+        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in slots.reads]
+        values = {key: self.values(parameter, row, other, (*path, key), key, where) for key, parameter in constraint.parameters.items()}
+        weight = self.values(Number(constraint.weight, positive=True), row, other, (*path, "weight"), "weight", where)
+        if len(self.faults) > known:
+            return None
+        return Part(
+            kind=constraint.kind,
+            psi=constraint.psi,
+            agents=np.stack(columns, axis=1).astype(np.int32),
+            owner=(row + self.first).astype(np.int32),
+            parameters=values,
+            weight=weight,
+            names=(),
+            sources=None if constraint.source is None else Repeated(constraint.source, len(row)),
+        )
+
+    def members(self, of: Any, path: Path, where: str) -> Ints:
+        """The places of those who have a constraint."""
+        count = self.group.count
+        if of is None:
+            return np.arange(count)
+        if isinstance(of, np.ndarray) and of.ndim == 1 and of.dtype.kind in "iu":
+            if not len(of) or (of.min() >= 0 and of.max() < count):
+                return of.astype(np.int64)
+            self.faults.append(Fault((*path, "of"), f"of holds places beyond 0 to {count - 1}", where))
+            return np.arange(0)
+        if of in ("first", "last"):
+            return np.array([0 if of == "first" else count - 1])
+        if isinstance(of, Mapping) and list(of) == ["every"] and type(of["every"]) is int and of["every"] >= 1:
+            return np.flatnonzero((self.layout.steps % of["every"] == 0).all(axis=1))
+        chosen = of if isinstance(of, list | tuple) else [of]
+        places = [self.find(name) for name in chosen if isinstance(name, str)]
+        inside = [place - self.first for place in places if place is not None and 0 <= place - self.first < count]
+        if len(inside) != len(chosen) or not inside:
+            example = f"first, last, {{every: 10}}, or ids of the group such as [{self.group.name}1]"
+            self.faults.append(Fault((*path, "of"), f"of is {shown(of)}, but must be one of {example}", where))
+        return np.unique(np.array(inside, dtype=np.int64))
+
+    class Slots(NamedTuple):
+        """Where the positions that a ψ takes come from: the owner, the related one, or an agent of the team; and the relation."""
+
+        reads: list[Any]
+        relation: Any
+
+    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> Slots:
+        reads: list[Any] = []
+        relation: Any = None
+        written = constraint.source is not None
+        for read in constraint.reads:
+            if isinstance(read, str) and (read == OWNER or (written and read == SELF)):
+                reads.append(OWNER)
+            elif not isinstance(read, str) or (written and read == OTHER):
+                relation = agent if isinstance(read, str) else read
+                reads.append(OTHER)
+            elif (place := self.find(read)) is not None:
+                reads.append(place)
+            else:
+                relative = f"; in a group, {SELF} is the member and {OTHER} the one that `agent` tells of" if written else ""
+                key = "psi" if written else "agent"
+                self.faults.append(Fault((*path, key), f"there is no agent {shown(read)}{relative}", where))
+        if OWNER not in reads and not self.faults:
+            key = "psi" if written else "agent"
+            self.faults.append(Fault((*path, key), f"it must read the position of its owner, {SELF}, but does not", where))
+        if OTHER in reads and relation is None:
+            message = f"agent is missing: it tells who `{OTHER}` is, such as -1 for the one ahead"
+            self.faults.append(Fault((*path, "agent"), message, where))
+        elif agent is not None and OTHER not in reads:
+            self.faults.append(Fault((*path, "agent"), f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", where))
+        fixed = [read for read in reads if isinstance(read, int)]
+        if len(set(fixed)) < len(fixed):
+            self.faults.append(Fault((*path, "agent"), "it names the same agent twice; name another agent", where))
+        return self.Slots(reads, relation)
+
+    def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+        """Of those who have a constraint and whom the relation leads somewhere: their places, and (in the team) whom it leads to."""
+        if relation is None:
+            return rows, np.zeros(len(rows), dtype=np.int64)
+        if isinstance(relation, np.ndarray):
+            inside = (relation >= 0) & (relation < self.group.count) if relation.dtype.kind in "iu" else np.zeros(1, dtype=bool)
+            if relation.shape == rows.shape and inside.all():
+                return self.apart_from_itself(rows, relation.astype(np.int64), path, where)
+            message = f"agent must be an array of {len(rows)} places from 0 to {self.group.count - 1}, one for each of these constraints"
+        elif isinstance(relation, Mapping):
+            k = relation.get("nearest")
+            if list(relation) == ["nearest"] and type(k) is int and 1 <= k < self.group.count:
+                return self.nearest(k, rows)
+            message = f"agent is {shown(relation)}, but must be {{nearest: k}} with k from 1 to {self.group.count - 1}"
+        else:
+            steps = list(relation) if isinstance(relation, list | tuple) else [relation]
+            axes = len(self.layout.sides)
+            if all(type(step) is int for step in steps) and any(steps) and len(steps) in (1, axes):
+                return self.shifted(steps, rows)
+            grid = f", or a list of {axes} of them, steps along the axes of the grid" if axes > 1 else ""
+            message = (
+                f"agent is {shown(relation)}, but must be an id, a whole number other than 0, such as -1 for the one ahead{grid}, "
+                "or {nearest: k}"
+            )
+        self.faults.append(Fault((*path, "agent"), message, where))
+        return rows[:0], rows[:0]
+
+    def apart_from_itself(self, rows: Ints, others: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+        if (rows == others).any():
+            self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
+        return rows, others + self.first
+
+    def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
+        """Along the group, or along the axes of its grid."""
+        count = self.group.count
+        if len(steps) == 1:
+            other = rows + steps[0]
+            if self.layout.ring:
+                other %= count
+            inside = (other >= 0) & (other < count) & (other != rows)
+            return rows[inside], other[inside] + self.first
+        target = self.layout.steps[rows] + np.array(steps)
+        inside = ((target >= 0) & (target < self.layout.sides)).all(axis=1)
+        rows = rows[inside]
+        other = np.ravel_multi_index(tuple(target[inside].T), self.layout.sides)
+        exists = other < count  # the last row of a grid may be short
+        return rows[exists], other[exists] + self.first
+
+    def nearest(self, k: int, rows: Ints) -> tuple[Ints, Ints]:
+        from scipy.spatial import cKDTree
+
+        places = self.layout.places
+        found = cKDTree(places, balanced_tree=False, compact_nodes=False).query(places[rows], k + 1, workers=-1)[1]
+        itself = found == rows[:, None]
+        itself[~itself.any(axis=1), -1] = True  # where places coincide it may not be among them
+        return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
+
+    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray:
+        """(M, …) of one parameter; of no use if it has faults."""
+        value, places = parameter.value, self.layout.places
+        if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
+            return places[row] - places[other - self.first] if key == "vector" else places[row]
+        if isinstance(value, np.ndarray) and value.ndim == (2 if isinstance(parameter, Vector) else 1) and not _fixed(parameter):
+            rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
+            return np.zeros(len(row)) if rows is None else rows
+        one = checked(parameter, self.dimension, path, key, where, self.faults)
+        return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
+
+    def told_apart(self, made: list[tuple[Part, Constraint, Path, str]]) -> list[tuple[Part, Constraint, Path, str]]:
+        """The same with names, numbered where an owner would have the same one twice."""
+        stems: dict[str, list[int]] = {}
+        others = []
+        for p, (part, constraint, _, _) in enumerate(made):
+            reads = part.agents if constraint.name is None else part.agents[:, :0]
+            others.append(_others(reads, part.owner))
+            stems.setdefault(constraint.name or f"{constraint.kind}({others[p].shape[1]})", []).append(p)
+        named = list(made)
+        for parts in stems.values():
+            owner = np.concatenate([made[p][0].owner for p in parts])
+            keys = [owner, *np.concatenate([others[p] for p in parts]).T]
+            rank, start = _ranks(keys), 0
+            for p in parts:
+                part, constraint, path, where = made[p]
+                stop = start + len(part.owner)
+                ids = self.ids if constraint.name is None else None
+                mine = rank[start:stop] if rank is not None else None
+                names = Derived(constraint.name or constraint.kind, ids, others[p], mine)
+                named[p] = replace(part, names=names), constraint, path, where
+                start = stop
+        return named
+
+
+def _fixed(parameter: Any) -> bool:
+    return not isinstance(parameter, Number | Vector)
+
+
+def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """(M, k − 1) the agents read besides the owner, who is among them; (M, 0) if none are asked for."""
+    if not agents.shape[1]:
+        return agents
+    if (agents[:, 0] == owner).all():
+        return agents[:, 1:]
+    return agents[agents != owner[:, None]].reshape(len(agents), agents.shape[1] - 1)
+
+
+def _ranks(keys: list[np.ndarray]) -> np.ndarray | None:
+    """How many with equal keys stand before each; None if none do."""
+    order = np.lexsort(keys[::-1]) if len(keys) > 1 else np.argsort(keys[0], kind="stable")
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    if new.all():
+        return None
+    rank = np.empty(len(order), dtype=np.int32)
+    rank[order] = np.arange(len(order)) - np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))
+    return rank
+
+
+def stems_clash(a: Counted, b: Counted) -> str | None:
+    """An id that two groups would both have, or None."""
+    short, long = sorted((a, b), key=lambda ids: len(ids.stem))
+    tail = long.stem[len(short.stem) :]
+    if not long.stem.startswith(short.stem) or not (tail == "" or (tail.isascii() and tail.isdigit() and tail[0] != "0")):
+        return None
+    for digits in range(1, len(str(len(long))) + 1):  # the smallest number of so many digits gives the smallest id
+        number = 10 ** (digits - 1)
+        if number <= len(long) and short.find(text := f"{long.stem}{number}") is not None:
+            return text
+    return None

@@ -1,0 +1,165 @@
+"""The natural size of a team, read off its constraints: what ``smoothing: auto`` and a start box that nobody gave are measured in.
+
+A constraint ψ = ½xᵀHx + b·x + c has the scale of its value where it is stationary, s = |c − ½ bᵀH⁺b| (r² for a disc of radius r) and
+the length √(2s/‖H‖) (r). One without curvature has the scale of its gradient over the team's length. So a team in millimetres and the
+same team in kilometres get the same ν·ψ, and take the same rounds.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from consat.numerics import float64, once
+from consat.problem.constraints.curvature import expand
+from consat.problem.constraints.domain import HUGE
+from consat.problem.family import Family
+from consat.problem.team import Team
+from consat.settings import Smoothing
+
+SHARPNESS = 5.0
+"""ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
+MARGIN = 4.0
+"""How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
+STRAIGHT = 1e-6
+"""Of a ψ that is not quadratic, a curvature below this part of its largest is none."""
+FLATTER = 0.5
+"""A step that is said to lead to where ψ is stationary must leave at most this part of its slope."""
+RIM, ROOM = 0.1, 1.0
+"""How much farther out than the team's places, at most, estimates from far away begin: of a convex team, and of one that is not, where
+agents need room to find a way around one another."""
+
+
+class Scale(NamedTuple):
+    """The natural size of a team.
+
+    Attributes:
+        psi: the smallest scale of a ψ, in its units.
+        length: of the positions.
+        center: (d,) mean of the points that constraints on one agent alone point to.
+        spread: largest distance of such a point from the centre on any axis.
+        typical: the median of the scales of all ψ.
+    """
+
+    psi: float
+    length: float
+    center: np.ndarray
+    spread: float
+    typical: float
+
+    @property
+    def reach(self) -> float:
+        """How far around the centre, on each axis, the team's places are thought to be."""
+        return MARGIN * self.length + self.spread
+
+
+class Region(NamedTuple):
+    """Where a team's places are, as every agent knows it.
+
+    Attributes:
+        center: (d,) the team's middle, length.
+        reach: how far around it the places are on each axis, length.
+    """
+
+    center: jax.Array
+    reach: jax.Array
+
+    @classmethod
+    def of(cls, size: Scale) -> Region:
+        return cls(jnp.asarray(size.center), jnp.asarray(size.reach))
+
+    def nearby(self, x: jax.Array, convex: bool) -> jax.Array:
+        """(n, d) positions: unchanged inside, and from far away brought to its rim, a little farther out the farther they were, keeping
+        their directions, so that no two fall together."""
+        away = (x - self.center[None, :]) / self.reach
+        far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
+        return self.center[None, :] + self.reach * away * ((1.0 + (RIM if convex else ROOM) * (1.0 - 1.0 / far)) / far)
+
+
+@functools.lru_cache(maxsize=16)
+@float64
+def scale(team: Team) -> Scale:
+    """Measure a team; 1 where nothing says otherwise. A team is measured once."""
+    measured = [_measure(family, team.dimension) for family in team.families]
+    psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
+    bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
+    slope = np.concatenate([np.zeros(0), *(m[2] for m in measured)])
+    centers = np.concatenate([np.zeros((0, team.dimension)), *(m[3] for m in measured)])
+    curved = np.isfinite(psi) & (psi > 0) & (bend > 0)
+    length = float(np.median(np.sqrt(2 * psi[curved] / bend[curved]))) if curved.any() else 1.0
+    flat = np.isfinite(slope) & (slope > 0) & ~curved
+    sizes = np.concatenate([psi[curved], slope[flat] * length])
+    center = centers.mean(axis=0) if len(centers) else np.zeros(team.dimension)
+    spread = float(np.abs(centers - center).max(initial=0.0))
+    smallest, typical = (float(sizes.min()), float(np.median(sizes))) if len(sizes) else (1.0, 1.0)
+    return Scale(smallest, length, center, spread, typical)
+
+
+def automatic(size: Scale) -> Smoothing:
+    """``smoothing: auto``: ν = `SHARPNESS` over the scale of ψ."""
+    nu = SHARPNESS / size.psi
+    return Smoothing(nu_alpha=nu, nu_beta=nu)
+
+
+def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
+    """(d,) low and (d,) high of where starts are drawn when nobody says."""
+    return size.center - size.reach, size.center + size.reach
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _second_order(
+    psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, jax.Array], at: jax.Array
+) -> tuple[jax.Array, ...]:
+    """(M,) values, (M, n) gradients and (M, n, n) Hessians at (M, n) places, n = arity·d."""
+
+    def flat(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
+        return psi(*x.reshape(arity, dimension), **parameters)
+
+    def both(x: jax.Array, parameters: dict[str, jax.Array]) -> tuple[jax.Array, ...]:
+        return (*jax.value_and_grad(flat)(x, parameters), jax.hessian(flat)(x, parameters))
+
+    return jax.vmap(both)(at, parameters)
+
+
+def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Scale, ‖H‖ and slope of each member, and the stationary points of those that read one agent alone."""
+    try:
+        value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
+    except ValueError:
+        return _measure_any(family, dimension)
+    hessian = once(hessian)
+    finite = np.isfinite(hessian).all(axis=(1, 2))
+    usable = np.isfinite(value) & np.isfinite(b).all(axis=1) & finite
+    hessian = np.where(np.asarray(finite)[:, None, None], hessian, 0.0)
+    value, b = np.where(usable, value, 0.0), np.where(usable[:, None], b, 0.0)
+    stationary = -np.matmul(np.linalg.pinv(hessian, hermitian=True), b[..., None])[..., 0]
+    bend = np.where(usable, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
+    psi_there = np.abs(value + 0.5 * np.einsum("mi,mi->m", b, stationary)) * family.weight
+    centers = stationary[(bend > 0)] if family.arity == 1 else np.zeros((0, dimension))
+    return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers
+
+
+def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The same beyond degree 2: by one step of Newton from the origin, which says something where it leads to where ψ is flatter.
+    Elsewhere ψ is as good as straight, and has its slope at the origin."""
+
+    def look(at: np.ndarray) -> tuple[np.ndarray, ...]:
+        value, slope, hessian = (
+            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters), jnp.asarray(at))
+        )
+        usable = (np.abs(value) <= HUGE) & (np.abs(slope) <= HUGE).all(axis=1) & (np.abs(hessian) <= HUGE).all(axis=(1, 2))
+        return usable, *(np.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in (value, slope, hessian))
+
+    usable, _, slope, hessian = look(np.zeros((family.size, family.arity * dimension)))
+    stationary = -np.matmul(np.linalg.pinv(hessian, STRAIGHT, hermitian=True), slope[..., None])[..., 0]
+    there, value, flatter, hessian = look(stationary)
+    steep = np.linalg.norm(slope, axis=1)
+    curved = usable & there & (np.linalg.norm(flatter, axis=1) <= FLATTER * steep)
+    bend = np.where(curved, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
+    centers = stationary[bend > 0] if family.arity == 1 else np.zeros((0, dimension))
+    return np.abs(value) * family.weight, bend * family.weight, steep * family.weight, centers

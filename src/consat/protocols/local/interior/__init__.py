@@ -1,0 +1,167 @@
+"""An agent's own part of the interior-point protocol: its Newton step, what it tells each neighbour, and the bound that it proves.
+
+`layout` says which variables an agent has and shares, and sorts agents into batches; `step` computes a round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.numerics import pick, taken
+from consat.problem.team import Team
+from consat.problem.units import Scale
+from consat.protocols.estimates import Estimates
+from consat.protocols.local.interior import step
+from consat.protocols.local.interior.layout import Batch, Plan, Route, Shared, Way, plan_of, route_of
+from consat.protocols.local.interior.step import Gains, Lanes, Mail, Memory, Proof, Units
+
+__all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "Units", "Way", "route_of"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Interior:
+    """The interior-point part of some agents: all of a team, or one alone.
+
+    Attributes:
+        plan: the agents by shape.
+        units: common knowledge.
+        talker: (P,) which of the agents speaks at each end of a link.
+        other: (P,) the other end of the same link; of one agent alone, whose links end elsewhere, nothing.
+        owner: (M,) whose constraint each is, family after family.
+        degree: (N,) how many neighbours each has.
+        level: (P,) whether the level travels over the pair, and with it the least margin.
+    """
+
+    plan: Plan
+    units: Units
+    talker: Array
+    other: Array
+    owner: Array
+    degree: Array
+    level: Array
+
+    @classmethod
+    def of(cls, team: Team, copies: Estimates, size: Scale) -> Interior:
+        """Of a whole team whose copies `route_of` has laid out."""
+        shared = Shared.of(copies)
+        talker, listener = shared.pairs.astype(np.int64).T
+        keys = talker * team.count + listener
+        owner = np.concatenate([np.zeros(0, dtype=np.int32), *(family.owner for family in team.families)])
+        return cls(
+            plan_of(team, copies, shared),
+            Units.of(size),
+            jnp.asarray(talker.astype(np.int32)),
+            jnp.asarray(np.searchsorted(keys, listener * team.count + talker).astype(np.int32)),
+            jnp.asarray(owner),
+            jnp.asarray(np.bincount(talker, minlength=team.count)),
+            jnp.asarray(shared.level),
+        )
+
+    @classmethod
+    def alone(cls, team: Team, copies: Estimates, shared: Shared, units: Units) -> Interior:
+        """Of one agent, a team of one, whose links end elsewhere."""
+        pairs, constraints = len(shared.pairs), sum(family.size for family in team.families)
+        talker, nothing = np.zeros(pairs, dtype=np.int32), np.zeros(0, dtype=np.int32)
+        owner = np.zeros(constraints, dtype=np.int32)
+        arrays = (jnp.asarray(each) for each in (talker, nothing, owner, np.array([pairs]), shared.level))
+        return cls(plan_of(team, copies, shared), units, *arrays)
+
+    def silence(self) -> Mail:
+        """The mail before anything was said; leading axis P."""
+        p, pairs = self.plan.width, len(self.talker)
+        matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
+        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, Proof(matrix, vector, number, number - 1.0, number))
+
+    def across(self, mail: Mail) -> Mail:
+        """What stands at the other ends."""
+        return jax.tree.map(lambda leaf: pick(leaf, self.other), mail)
+
+    def begin(self, x: Array, gains: Gains) -> Memory:
+        """What the agents remember at the start, from first estimates (C, d)."""
+
+        def start(batch: Batch) -> Memory:
+            y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
+            return _out(step.begin(_lanes(batch, self.units, gains, self.plan.exact), y, gains))
+
+        return self._collected([start(batch) for batch in self.plan.batches])
+
+    def round(self, memory: Memory, inbox: Mail, margin: Array, gains: Gains) -> tuple[Memory, Mail]:
+        """One round: what the agents remember, and what stands at each end of a link.
+
+        Args:
+            memory: before.
+            inbox: what was last heard over each end.
+            margin: (N,) ᾱ_i where the bodies are.
+            gains: of the protocol.
+        """
+        units, pairs, inbox = self.units, len(self.talker), self._counted(inbox)
+        y, told = _normal(memory.y, units), margin / units.psi
+
+        def turn(batch: Batch) -> tuple[Memory, Mail]:
+            agents, rows, ends, shared = batch.agents[0], batch.rows[0], batch.pairs[0], batch.shared[0]
+            multiplier = taken(memory.multiplier, batch.members[0], 0.0)
+            mine = Memory(jnp.moveaxis(taken(y, rows, 0.0), 1, -1), multiplier, *(leaf[agents] for leaf in memory[2:]))
+            p = shared.shape[1]
+
+            def at(values: Array, empty: float = 0.0) -> Array:
+                found = jnp.moveaxis(taken(values, ends, empty), 1, -1) if pairs else jnp.zeros((0, *values.shape[1:], len(agents)))
+                return found[(slice(None), *[slice(p)] * (values.ndim - 1))]
+
+            heard = Mail(
+                at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
+                Proof(*map(at, inbox.proof)),
+            )  # fmt: skip
+            found, mail = step.act(
+                _lanes(batch, units, gains, self.plan.exact), shared, rows < len(y), mine, heard, told=told[agents], gains=gains
+            )
+            return _out(found), jax.tree.map(lambda leaf: _widened(leaf, self.plan.width), mail)
+
+        found = [turn(batch) for batch in self.plan.batches]
+        mail = jax.tree.map(lambda *leaves: pick(jnp.concatenate(leaves), self.plan.pair), *[each[1] for each in found])
+        return self._collected([each[0] for each in found]), mail
+
+    def least(self, inbox: Mail, margin: Array) -> Array:
+        """(N,) the least margin of the team that each agent knows of, given its own, (N,)."""
+        told = self._counted(inbox).margin * self.units.psi
+        return jnp.minimum(margin, jax.ops.segment_min(told, self.talker, len(margin), indices_are_sorted=True))
+
+    def _counted(self, inbox: Mail) -> Mail:
+        """With the margins that came along the spanning tree alone: on a loop an old one would go round for ever."""
+        return inbox._replace(margin=jnp.where(self.level, inbox.margin, jnp.inf))
+
+    def _collected(self, found: list[Memory]) -> Memory:
+        """The answers of all batches, each where it belongs."""
+        plan = self.plan
+        whole = Memory(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+        agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "multiplier")}
+        x = self.units.center[None] + self.units.length * pick(whole.y, plan.row)
+        multiplier = pick(whole.multiplier, plan.member) if len(whole.multiplier) else jnp.zeros(0)
+        return Memory(y=x, multiplier=multiplier, **agents)
+
+
+def _normal(x: Array, units: Units) -> Array:
+    return (x - units.center[None]) / units.length
+
+
+def _lanes(batch: Batch, units: Units, gains: Gains, exact: bool) -> Lanes:
+    n, count = batch.rows.shape[1:]
+    return Lanes(batch, jax.tree.map(lambda leaf: leaf[0], batch.kinds), units, gains.cap, (n, len(units.center), count), exact)
+
+
+def _out(memory: Memory) -> Memory:
+    """The agents first: (n·A, d), (m·A,), (A,)."""
+    y = jnp.moveaxis(memory.y, -1, 1)
+    return memory._replace(y=y.reshape(-1, y.shape[-1]), multiplier=memory.multiplier.reshape(-1))
+
+
+def _widened(leaf: Array, width: int) -> Array:
+    """(g, p, …, A) → (g·A, width, …)."""
+    leaf = jnp.moveaxis(leaf, -1, 1)
+    leaf = leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
+    return jnp.pad(leaf, [(0, 0), *[(0, width - size) for size in leaf.shape[1:]]])

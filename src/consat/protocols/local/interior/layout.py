@@ -1,0 +1,353 @@
+"""Which variables an agent has in the interior-point protocol, and which of them it shares with which neighbour.
+
+An agent's variables are the positions of which it holds copies, and its level. A position travels along a tree: its holders, joined by
+links between them. The level travels along a spanning tree of each cluster. So what comes from a neighbour about a variable never comes
+back to it through others, unless several variables go round a loop together; where all links in use form a tree, nothing does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order
+
+from consat.numerics import once
+from consat.problem.constraints.curvature import hessians
+from consat.problem.family import Family, distinct
+from consat.problem.graphs import middles
+from consat.problem.team import Team
+from consat.protocols.estimates import Estimates
+
+Route = Literal["tree", "links"]
+"""Along what copies travel: along one spanning tree, or along the links themselves, each position along a tree of its own."""
+
+Vectors = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """What is known beforehand of the constraints of one family.
+
+    Attributes:
+        psi: the function.
+        curvature: (R, arity·d) vectors v with Σ v vᵀ = the convex part of −∇²ψ for weight 1; None where that varies with the position.
+        concave: whether ψ is proven concave.
+        quadratic: whether it is a polynomial of degree ≤ 2.
+    """
+
+    psi: Callable[..., Any]
+    curvature: Vectors | None
+    concave: bool
+    quadratic: bool
+
+
+class Kind(NamedTuple):
+    """The constraints of one family in a batch: m an agent, padded; leading axis the chunks, last axis the agents of a chunk.
+
+    Attributes:
+        slots: (chunks, m, arity, A) which of the agent's copies each constraint reads.
+        parameters: (chunks, m, …, A).
+        weight: (chunks, m, A).
+        used: (chunks, m, A) false where padded.
+    """
+
+    slots: Array
+    parameters: dict[str, Array]
+    weight: Array
+    used: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Batch:
+    """Agents of like shape: up to n copies, m constraints, g neighbours and p variables shared with a neighbour.
+
+    Attributes:
+        agents: (chunks, A) which; the last is repeated where a chunk is not full.
+        rows: (chunks, n, A) the rows of their copies, their own first; padded past the last row.
+        members: (chunks, m, A) places of their constraints among the multipliers; padded past the last.
+        pairs: (chunks, g, A) their ends of links to neighbours; padded past the last.
+        shared: (chunks, g, p, A) which of their variables they share with each, the level being number n·d; padded with n·d + 1.
+        kinds: their constraints, a family each.
+        forms: what is known of these beforehand.
+    """
+
+    agents: Array
+    rows: Array
+    members: Array
+    pairs: Array
+    shared: Array
+    kinds: tuple[Kind, ...]
+    forms: tuple[Form, ...] = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Plan:
+    """All agents in batches, and where the answers of each stand among those of all batches, one after the other.
+
+    Attributes:
+        batches: the agents.
+        row: (C,) of each copy.
+        agent: (N,) of each agent.
+        member: (M,) of each constraint, family after family.
+        pair: (P,) of each end of a link.
+        floats: (P,) how many numbers a message over each end holds.
+        width: variables that two neighbours share, at most.
+        exact: whether what agents share travels along trees: then nothing that one has said comes back to it through others.
+    """
+
+    batches: tuple[Batch, ...]
+    row: Array
+    agent: Array
+    member: Array
+    pair: Array
+    floats: Array
+    width: int = field(metadata={"static": True})
+    exact: bool = field(metadata={"static": True})
+
+
+@dataclass(frozen=True)
+class Shared:
+    """The variables that neighbours share.
+
+    Attributes:
+        pairs: (P, 2) directed pairs (agent, neighbour), sorted.
+        pair: (S,) which pair, in order, …
+        row: (S,) … shares which of the agent's rows, in the order of positions; −1 for the level, which comes last.
+        exact: see `Plan`.
+    """
+
+    pairs: np.ndarray
+    pair: np.ndarray
+    row: np.ndarray
+    exact: bool
+
+    @classmethod
+    def of(cls, copies: Estimates) -> Shared:
+        """What the agents with these copies share."""
+        count = len(copies.own)
+        here, there = _tree(copies.count, copies.edges, copies.own)
+        talk = copies.holder[copies.edges].astype(np.int64)
+        keys = copies.holder[here].astype(np.int64) * count + copies.holder[there]
+        span = spanning_tree(count, copies.links)
+        level = np.concatenate([span[:, 0].astype(np.int64) * count + span[:, 1], span[:, 1].astype(np.int64) * count + span[:, 0]])
+        pairs = distinct(talk[:, 0] * count + talk[:, 1])
+        pair = np.searchsorted(pairs, np.concatenate([keys, level]))
+        position = np.concatenate([copies.position[here], np.full(len(level), count)])
+        row = np.concatenate([here, np.full(len(level), -1)])
+        order = np.lexsort((position, pair))
+        directed = np.stack(np.divmod(pairs, max(count, 1)), axis=1).astype(np.int32)
+        return cls(directed, pair[order], row[order], len(pairs) == 2 * _tree_links(copies))
+
+    @property
+    def level(self) -> np.ndarray:
+        """(P,) which pairs share the level."""
+        found = np.zeros(len(self.pairs), dtype=bool)
+        found[self.pair[self.row < 0]] = True
+        return found
+
+    def sizes(self, dimension: int) -> np.ndarray:
+        """(P,) how many numbers the shared variables of each pair are."""
+        width = np.where(self.row < 0, 1, dimension)
+        return np.bincount(self.pair, weights=width, minlength=len(self.pairs)).astype(np.int64)
+
+
+def _tree(rows: int, edges: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of edges between copies of the same position, both ways, those of a tree that spans them, found breadth first from the owner."""
+    root = np.full(len(own), rows)
+    here, there = np.concatenate([edges[:, 0], root, own]), np.concatenate([edges[:, 1], own, root])
+    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(rows + 1, rows + 1)).tocsr()
+    order, parent = breadth_first_order(graph, rows, directed=True)
+    child = order[parent[order] >= 0]
+    child = child[parent[child] < rows]
+    up = parent[child]
+    return np.concatenate([child, up]), np.concatenate([up, child])
+
+
+def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
+    """(L', 2) the links of a breadth-first spanning tree of every component, from a middle agent of it."""
+    middle = middles(count, links)
+    here = np.concatenate([links[:, 0], links[:, 1], np.full(len(middle), count)])
+    there = np.concatenate([links[:, 1], links[:, 0], middle])
+    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(count + 1, count + 1)).tocsr()
+    order, parent = breadth_first_order(graph, count, directed=True)
+    child = order[1:]
+    child = child[parent[child] < count]
+    found = np.sort(np.stack([child, parent[child]], axis=1), axis=1).astype(np.int32)
+    return found[np.lexsort((found[:, 1], found[:, 0]))]
+
+
+def _tree_links(copies: Estimates) -> int:
+    """How many links the clusters have where these are trees."""
+    return len(copies.own) - 1 - int(copies.cluster.max(initial=-1))
+
+
+WIDE = 40
+"""Copies travel along the tree while no message holds more than about this many shared numbers, and along the links beyond."""
+
+
+class Way(NamedTuple):
+    """Along what the copies of a team travel.
+
+    Attributes:
+        route: along one spanning tree, or along the links.
+        copies: who holds what then.
+        why: this route was taken.
+    """
+
+    route: Route
+    copies: Estimates
+    why: str
+
+
+def route_of(team: Team, layout: Literal["full", "local"], *, exact: bool = True) -> Way:
+    """Along what the copies of a team travel. Along a tree steps are exact and the team proves its bound; along the links of a team with
+    loops a formation that satisfies everybody is found in fewer rounds.
+
+    Args:
+        team: whose clusters are connected.
+        layout: of the estimates.
+        exact: whether to take a spanning tree where there are loops, if it is narrow enough.
+    """
+    along_links = Estimates.of(team, layout)
+    if len(along_links.links) == _tree_links(along_links):
+        return Way("tree", along_links, "the links form a tree")
+    if not exact:
+        return Way("links", along_links, "the links form loops; max-min takes a spanning tree, where it is narrow enough")
+    tree = team.with_links(spanning_tree(team.count, along_links.links))
+    along_tree = Estimates.of(tree, layout)
+    width = int(Shared.of(along_tree).sizes(team.dimension).max(initial=0))
+    if width <= WIDE:
+        return Way("tree", along_tree, f"a spanning tree is narrow enough: neighbours share at most {width} numbers")
+    return Way("links", along_links, f"over a spanning tree neighbours would share {width} numbers, more than {WIDE}")
+
+
+ALIKE = 2**19
+"""Agents make one batch, padded to a common shape, while the matrices of all hold at most so many numbers; else one for each size."""
+
+
+class _Group(NamedTuple):
+    agents: np.ndarray
+    n: int
+    g: int
+    p: int
+
+
+def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
+    """Sort the agents of a team into batches of like shape."""
+    count, d = team.count, team.dimension
+    first = np.searchsorted(copies.holder, np.arange(count + 1))
+    held = np.diff(first)
+    degree = np.bincount(shared.pairs[:, 0], minlength=count)
+    size = shared.sizes(d)
+    widest = np.ones(count, dtype=np.int64)
+    np.maximum.at(widest, shared.pairs[:, 0], size)
+    power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # up to 8, 32, 128, …
+    if count * max(degree.max(initial=0), 1) * (held.max(initial=0) * d + 1) ** 2 <= ALIKE:
+        power[:] = 0
+    forms = [_form(family, d) for family in team.families]
+    start = np.cumsum([0, *(family.size for family in team.families)])
+    slot = np.arange(copies.count) - first[copies.holder]  # the own copy first, the others in order
+    mine = slot[copies.own]
+    slot = np.where(slot == mine[copies.holder], 0, slot + (slot < mine[copies.holder]))
+    made = [
+        _made(team, copies, shared, forms, start, slot, group=_Group(np.flatnonzero(power == one), *(
+            int(values[power == one].max(initial=0)) for values in (held, degree, widest)
+        )))
+        for one in np.unique(power)
+    ]  # fmt: skip
+    where = {}
+    for name, total in (("rows", copies.count), ("agents", count), ("members", int(start[-1])), ("pairs", len(shared.pairs))):
+        place, offset = np.zeros(total, dtype=np.int32), 0
+        for batch in made:
+            flat = np.asarray(getattr(batch, name)).ravel()
+            inside = np.flatnonzero(flat < total)
+            place[flat[inside]] = offset + inside
+            offset += flat.size
+        where[name] = jnp.asarray(place)
+    places = size - np.bincount(shared.pair, weights=shared.row < 0, minlength=len(shared.pairs)).astype(np.int64)
+    # a quadratic with barrier, level and margin, and a proof with its constant, weight and error
+    floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
+    return Plan(
+        tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
+        jnp.asarray(floats), int(size.max(initial=1)), shared.exact,
+    )  # fmt: skip
+
+
+def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], start: np.ndarray, slot: np.ndarray, *, group: _Group) -> Batch:
+    agents, d = group.agents, team.dimension
+    place = np.full(team.count, -1)
+    place[agents] = np.arange(len(agents))
+    A, n = len(agents), group.n
+
+    rows = np.full((n, A), copies.count, dtype=np.int32)
+    chosen = np.flatnonzero(place[copies.holder] >= 0)
+    rows[slot[chosen], place[copies.holder[chosen]]] = chosen
+
+    pairs = np.full((group.g, A), len(shared.pairs), dtype=np.int32)
+    talker = shared.pairs[:, 0]
+    nth = np.arange(len(talker)) - np.searchsorted(talker, talker)
+    ours = np.flatnonzero(place[talker] >= 0)
+    pairs[nth[ours], place[talker[ours]]] = ours
+
+    variables = np.full((group.g, group.p, A), n * d + 1, dtype=np.int32)
+    width = np.where(shared.row < 0, 1, d)
+    before = np.cumsum(width) - width
+    within = before - before[np.searchsorted(shared.pair, shared.pair)]
+    who = place[talker[shared.pair]]
+    for axis in range(d):
+        take = np.flatnonzero((who >= 0) & (axis < width))
+        value = np.where(shared.row[take] < 0, n * d, slot[shared.row[take]] * d + axis)
+        variables[nth[shared.pair[take]], within[take] + axis, who[take]] = value
+
+    kinds, kept, members = [], [], []
+    for family, form, offset in zip(team.families, forms, start[:-1], strict=True):
+        mine = np.flatnonzero(place[family.owner] >= 0)
+        if not len(mine):
+            continue
+        mine = mine[np.argsort(family.owner[mine], kind="stable")]
+        owner = place[family.owner[mine]]
+        order = np.arange(len(mine)) - np.searchsorted(family.owner[mine], family.owner[mine])
+        m = int(order.max()) + 1
+        index = np.full((m, A), -1, dtype=np.int64)
+        index[order, owner] = mine
+        used = index >= 0
+        filled = np.where(used, index, mine[0])
+        held = slot[copies.rows(family.owner[:, None], family.agents)]  # (M_f, arity)
+        slots = np.where(used[:, None, :], np.moveaxis(held[filled], -1, 1), 0)
+        kinds.append(Kind(
+            jnp.asarray(slots.astype(np.int32)[None]),
+            {key: jnp.asarray(np.moveaxis(np.asarray(value)[filled], 1, -1)[None]) for key, value in family.parameters.items()},
+            jnp.asarray(np.asarray(family.weight)[filled][None]),
+            jnp.asarray(used[None]),
+        ))  # fmt: skip
+        kept.append(form)
+        members.append(np.where(used, offset + index, start[-1]).astype(np.int32))
+    stacked = np.concatenate([np.zeros((0, A), dtype=np.int32), *members])
+    arrays = [jnp.asarray(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
+    return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept))
+
+
+def _form(family: Family, dimension: int) -> Form:
+    from consat.problem.constraints.curvature import Curvature, read_curvatures
+
+    readings = read_curvatures(family.psi, family.arity, dimension, family.parameters, family.size)
+    found = once(readings.curvature)
+    concave = bool(((found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)).all())
+    try:
+        constant = once(hessians(family.psi, family.arity, dimension, family.parameters, family.size))
+    except ValueError:
+        return Form(family.psi, None, concave, quadratic=False)
+    if len(constant) != 1 or not np.isfinite(constant).all():
+        return Form(family.psi, None, concave, quadratic=readings.degree is not None)
+    values, vectors = np.linalg.eigh(-constant[0])
+    rows = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 1e-12 * max(1e-300, np.abs(values).max(initial=0.0))].T
+    return Form(family.psi, tuple(tuple(map(float, row)) for row in rows), concave, quadratic=readings.degree is not None)

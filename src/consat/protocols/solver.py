@@ -1,0 +1,184 @@
+"""What an agent can ask of itself in rounds, `consat.protocols.Solver`: the same for all agents of a team at once, and for one alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from consat.numerics import Groups, pick
+from consat.problem.constraints.domain import HUGE
+from consat.problem.objective import Nu, Objective
+from consat.problem.units import Region
+from consat.protocols.base import Links
+from consat.protocols.local import proximal as prox
+from consat.protocols.local.interior import Interior
+
+EXACT = prox.Precision(tolerance=1e-9)
+"""Of every local step of an agent alone, and of a small team."""
+FLAT = 1e-6
+"""A ψ that changes by less than this, in units of 1/ν, over the team's unit of length, has no slope to climb."""
+
+
+class Tries(NamedTuple):
+    """How first estimates are moved, one try after the other, (K,) each.
+
+    Attributes:
+        others: which part of the way to the agent's own position its copies of others are moved.
+        own: which part of the way to the mean of these its own position is.
+        home: which part of the way to the team's middle all are.
+        scale: of random steps, in units of the team's reach.
+    """
+
+    others: Any
+    own: Any
+    home: Any
+    scale: Any
+
+    @classmethod
+    def all(cls) -> Tries:
+        """First towards each other, by ever larger parts; then at random, ever farther, from where they are and from the team's middle."""
+        moves = [(part, 0.0, 0.0, 0.0) for part in PARTS] + [(0.0, part, 0.0, 0.0) for part in PARTS]
+        draws = [(0.0, 0.0, home, scale) for scale in SCALES for home in (0.0, 1.0) for _ in range(DRAWS)]
+        return cls(*(jnp.array(column) for column in zip(*moves, *draws, strict=True)))
+
+
+PARTS = (0.5, 0.75, 0.9, 0.97, 0.99)
+SCALES = tuple(2.0**k for k in range(-8, 1))
+DRAWS = 4
+"""Random tries of each scale."""
+
+
+class Place(NamedTuple):
+    """Where a search for first estimates stands: the number of the try, the estimates, (rows, d), and who is lost there, (N,)."""
+
+    number: Array
+    x: Array
+    lost: Array
+
+
+@dataclass(frozen=True)
+class Footing:
+    """Moves first estimates off where an agent's constraints do not say where to go: where one of its ψ is −∞, or where they are violated
+    and flat (design, section 10).
+
+    Attributes:
+        local: the agents' objectives over the copies that they hold.
+        nu: the smoothing.
+        length: the team's unit of length.
+        region: where the team's places are.
+        holder: (rows,) who holds each copy, in order.
+        own: (N,) rows of own positions.
+        still: whether these stay where they are, as those of bodies do.
+    """
+
+    local: Objective
+    nu: Nu
+    length: Array
+    region: Region
+    holder: Array
+    own: Array
+    still: bool = False
+
+    def lost(self, x: Array) -> Array:
+        """(N,) who does not know where to go."""
+        margin = self.local.agent_margins(x)
+        slope = jnp.max(jnp.abs(self.local.ascent(x, self.nu)), axis=1)
+        steepest = jax.ops.segment_max(slope, self.holder, len(self.own), indices_are_sorted=True)
+        return (margin < -HUGE) | ((margin <= 0.0) & (steepest * self.nu.alpha * self.length < FLAT))
+
+    def find(self, x: Array) -> Array:
+        """(rows, d) the first of the `Tries` that helps, agent by agent; x where none is needed or none does."""
+        if not any(batch.partial for batch in self.local.batches):
+            return x
+        tries, moved = Tries.all(), self.moves(x)
+
+        def improve(at: Place) -> Place:  # the first try is none, so that ψ is looked at in one place of the program
+            step = moved(at.number, jax.tree.map(lambda each: each[at.number - 1], tries))
+            candidate = jnp.where(pick(at.lost, self.holder)[:, None] & (at.number > 0), x + step, at.x)
+            return Place(at.number + 1, candidate, self.lost(candidate))
+
+        def goes_on(at: Place) -> Array:
+            return (at.number <= len(tries.own)) & jnp.any(at.lost)
+
+        found = jax.lax.while_loop(goes_on, improve, Place(jnp.asarray(0), x, jnp.ones(len(self.own), bool)))
+        return jnp.where(pick(found.lost, self.holder)[:, None], x, found.x)
+
+    def moves(self, x: Array) -> Callable[[Array, Tries], Array]:
+        """The step, (rows, d), of a try with its number. What is drawn for a copy hangs on its rank among those of its holder, not on who
+        else there is."""
+        count, row = len(self.own), jnp.arange(len(x), dtype=self.own.dtype)
+        is_own = (pick(self.own, self.holder) == row)[:, None]
+        rank = row - jnp.searchsorted(self.holder, self.holder).astype(row.dtype)
+        size, total = (jax.ops.segment_sum(each, self.holder, count, indices_are_sorted=True) for each in (jnp.ones(len(x)), x))
+        mine, mean = (pick(each, self.holder) for each in (x[self.own], (total - x[self.own]) / jnp.maximum(size - 1.0, 1.0)[:, None]))
+
+        def step(number: Array, how: Tries) -> Array:
+            key = jax.random.fold_in(jax.random.key(0), number)
+            noise = jax.vmap(lambda place: jax.random.normal(jax.random.fold_in(key, place), x.shape[1:]))(rank)
+            together = jnp.where(is_own, how.own * (mean - x), how.others * (mine - x)) + how.home * (self.region.center[None, :] - x)
+            whole = together + how.scale * self.region.reach * noise
+            return jnp.where(is_own, 0.0, whole) if self.still else whole
+
+        return step
+
+
+@dataclass(frozen=True)
+class LocalSolver:
+    """Some agents, over the copies that they hold; what is one number an agent has one row an agent.
+
+    Attributes:
+        links: their ends of their links.
+        length: the team's unit of length.
+        region: where the team's places are.
+        plan: the agents by shape, for their local steps.
+        precision: of these.
+        interior: their part in `consat.protocols.interior_point`; None of other protocols.
+        nu: the smoothing.
+        local: every agent's objective over its copies.
+        holder: (rows,) who holds each copy, in order.
+        own: (N,) rows of own positions.
+        talkers: groups the ends by agent.
+        hops: see `consat.problem.graphs.hops`.
+        convex: whether every ψ of the team is known to be concave.
+    """
+
+    links: Links
+    length: Array
+    region: Region
+    plan: prox.Plan | None
+    interior: Interior | None
+    nu: Nu
+    local: Objective
+    holder: Array
+    own: Array
+    talkers: Groups
+    hops: int = field(metadata={"static": True})
+    convex: bool = field(metadata={"static": True})
+    precision: prox.Precision = field(metadata={"static": True})
+
+    def recall(self, x: Array, kappa: Array) -> prox.Memory:
+        assert self.plan is not None, "of a protocol that takes proximal steps"
+        return prox.recall(self.plan, self.nu, x, kappa)
+
+    def prox(self, v: Array, kappa: Array, x: Array, memory: prox.Memory) -> tuple[Array, prox.Memory, Array]:
+        assert self.plan is not None, "of a protocol that takes proximal steps"
+        return prox.step(self.plan, self.nu, v, kappa, x, memory, offset=0.0, precision=self.precision)
+
+    def nearby(self, x: Array) -> Array:
+        idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
+        near = jnp.where(idle[:, None], x, self.region.nearby(x, self.convex))
+        return Footing(self.local, self.nu, self.length, self.region, self.holder, self.own).find(near)
+
+    def margin(self, x: Array) -> Array:
+        return self.local.agent_margins(x)
+
+    def to_rows(self, numbers: Array) -> Array:
+        return pick(numbers, self.holder)
+
+    def least(self, numbers: Array) -> Array:
+        return -self.talkers.max(-numbers)

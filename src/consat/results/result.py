@@ -1,0 +1,202 @@
+"""What came out of a run: a summary, labelled arrays, save and load."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from consat.errors import InvalidResult
+from consat.problem.team import Team
+from consat.results.netcdf import FINAL, SCHEMA, UNITS, VARIABLES, axis_names
+from consat.results.trace import Trace
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+RESULT = "result.nc"
+"""The result file in the directory of a run."""
+LARGE = 2**28
+"""Bytes of a file beyond which arrays are read only when they are asked for."""
+MOST_EXPLAINED = 200
+"""Agents of a team of which it is said at once what stands in the way; of more, `consat.solve` says it."""
+SLIGHT = 1e-3
+"""A constraint with a smaller multiplier does not bind."""
+
+
+class Result:
+    """The outcome of a run.
+
+    Attributes:
+        summary: what ``consat run --json`` prints: status, verdict, margin, bounds, satisfied_from, positions, agents …
+        data: labelled arrays over time (or round), agent and axis; see `dataset`.
+        scenario: the scenario text, or None for a team that no text can say (own callables).
+    """
+
+    def __init__(self, summary: Mapping[str, Any], data: xr.Dataset | None = None, *, trace: Trace | None = None, team: Team | None = None,
+                 scenario: str | None = None) -> None:  # fmt: skip
+        self.summary = dict(summary)
+        self.scenario = scenario
+        self._data = data
+        self._trace = trace
+        self._team = team
+
+    @functools.cached_property
+    def data(self) -> xr.Dataset:
+        """The recorded arrays with named dimensions, units and everything needed to repeat the run among the attributes."""
+        if self._data is not None:
+            return self._data
+        assert self._trace is not None
+        assert self._team is not None
+        if self._trace.file is not None:
+            return _read(self._trace.file)
+        return dataset(self._trace, self._team, self.summary, self.scenario)
+
+    @functools.cached_property
+    def team(self) -> Team | None:
+        """The team that was run; read from the scenario text after loading, None if there is none."""
+        if self._team is not None or self.scenario is None:
+            return self._team
+        from consat.scenario import loads
+
+        return loads(self.scenario, name=self.summary["scenario"]).team
+
+    def binding(self, name: str) -> list[str]:
+        """The agents on whom their constraint of this name binds at the end of the run; empty where agents are not listed."""
+        agents = (self.summary["agents"] or {}).items()
+        return [agent for agent, told in agents if any(c["name"] == name and (c["multiplier"] or 0) > SLIGHT for c in told["constraints"])]
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write NetCDF-4; `Result.load` reads it back without loss."""
+        target = Path(path)
+        if self._trace is not None and self._trace.file is not None and target.resolve() == self._trace.file.resolve():
+            return target  # it was written as the run went on
+        target.parent.mkdir(parents=True, exist_ok=True)
+        self.data.to_netcdf(target, engine="h5netcdf", format="NETCDF4")
+        return target
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Result:
+        """Read what `save` wrote.
+
+        Args:
+            path: of the file, or of the directory of a run, which holds it.
+
+        Raises:
+            InvalidResult: no such file, or not a result of consat.
+        """
+        path = Path(path) / RESULT if Path(path).is_dir() else Path(path)
+        if not path.is_file():
+            raise InvalidResult(f"{path}: there is no such file; `consat run SCENARIO --out DIR` writes DIR/{RESULT}")
+        try:
+            data = _read(path)
+            schema, summary, scenario = data.attrs["schema"], json.loads(data.attrs["summary"]), data.attrs["scenario"]
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            raise InvalidResult(f"{path}: this is not a result of consat ({error}); give a file that `consat run --out` wrote") from error
+        if schema != SCHEMA:
+            raise InvalidResult(f"{path}: this is a {schema!r}, but this version of consat reads {SCHEMA!r}")
+        return cls(summary, data, scenario=scenario or None)
+
+    def plot(self, directory: str | os.PathLike[str] | None = None) -> list[Path]:
+        """The figures of the run, as files in `directory`, or on the screen if None; see `consat.views.figures`."""
+        from consat.views import figures
+
+        return figures.save(self, directory) if directory is not None else figures.show(self)
+
+    def animate(self, path: str | os.PathLike[str]) -> Path:
+        """The run as an animated GIF; see `consat.views.animation`."""
+        from consat.views import animation
+
+        return animation.save(self, path)
+
+    def __str__(self) -> str:
+        from consat.views import words
+
+        return words.summary(self.summary, self.reasons)
+
+    @functools.cached_property
+    def reasons(self) -> list[str]:
+        """What conflicts in a team that cannot be satisfied, how much is missing, and what would do, as `consat.solve` says it; empty for
+        others, and for teams of more than `MOST_EXPLAINED` agents."""
+        team = self.team if self.summary["verdict"] == "infeasible" else None
+        if team is None or team.count > MOST_EXPLAINED:
+            return []
+        from consat.certify.optimum import max_min
+        from consat.certify.reasons import explain
+
+        return explain(team, max_min(team))
+
+    def __repr__(self) -> str:
+        return f"<Result of {self.summary['scenario']}: {self.summary['status']}, margin {self.summary['margin']}>"
+
+
+def _read(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    if path.stat().st_size > LARGE:
+        return xr.open_dataset(path, engine="h5netcdf")
+    return xr.load_dataset(path, engine="h5netcdf")
+
+
+def labels(
+    ids: Sequence[str], agents: np.ndarray | None, cluster: np.ndarray, copies: tuple[np.ndarray, np.ndarray] | None
+) -> dict[str, np.ndarray]:
+    """Who is who in a record: ``agent`` and ``cluster``, (R,), if anybody is recorded; with estimates ``holder`` and ``held``, (E,).
+
+    Args:
+        ids: of the team.
+        agents: (R,) who is recorded; all if None.
+        cluster: (N,) of each agent.
+        copies: (E,) holder and (E,) held, if estimates are recorded.
+    """
+    found: dict[str, np.ndarray] = {}
+    if agents is None or len(agents):
+        names = list(ids) if agents is None else [ids[int(i)] for i in agents]
+        found |= {"agent": np.array(names, dtype=object), "cluster": cluster if agents is None else cluster[agents]}
+    if copies is not None and len(copies[0]):
+        for name, members in zip(("holder", "held"), copies, strict=True):
+            found[name] = np.array([ids[int(i)] for i in members], dtype=object)
+    return found
+
+
+def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool) -> list[str]:
+    """What is recorded, of people with these `labels`."""
+    of_agents = ["position", "velocity", "agent_margin"] if "agent" in named else []
+    of_copies = ["estimate", *(["integral"] if integral else [])] if "holder" in named else []
+    return ["margin", "smooth_margin", *(["bound"] if bound else []), *of_agents, *of_copies]
+
+
+def attributes(summary: Mapping[str, Any], scenario: str | None) -> dict[str, Any]:
+    """Of a result file: everything that is known at the end of a run."""
+    told = {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
+    return {"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or "", **told}
+
+
+def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> xr.Dataset:
+    """A trace with names: dimensions time or round, agent, axis, and for copies `copy` with its holder and the agent it is of."""
+    import xarray as xr
+
+    clock = trace.clock
+    copies = None if trace.estimate is None else (trace.holder, trace.held)
+    named = labels(team.ids, trace.recorded, trace.cluster, copies)
+    along = {"agent": "agent", "cluster": "agent", "holder": "copy", "held": "copy"}
+    data = xr.Dataset(
+        {
+            name: ((clock, *VARIABLES[name][0]), getattr(trace, name), VARIABLES[name][1])
+            for name in variables(named, integral=trace.integral is not None, bound=trace.bound is not None)
+        },
+        coords={
+            clock: (clock, trace.steps, {"units": UNITS[clock]}),
+            "axis": axis_names(team.dimension),
+            **{name: (along[name], values) for name, values in named.items()},
+        },
+        attrs=attributes(summary, scenario),
+    )
+    if trace.recorded is not None:
+        data["final_position"] = (("member", "axis"), trace.end, FINAL)
+    return data
