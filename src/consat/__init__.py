@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from consat.problem.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.problem.groups import Group, each
     from consat.problem.objective import margins
+    from consat.problem.schedule import Schedule, schedule
     from consat.problem.team import Agent, Team
     from consat.results.result import Result
     from consat.runs.runner import resume, run
@@ -37,6 +38,7 @@ _HOME = {
     "scenario": ("Scenario", "dump", "load", "loads"),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "problem.groups": ("Group", "each"),
+    "problem.schedule": ("Schedule", "schedule"),
     "problem.team": ("Agent", "Team"),
 }  # fmt: skip
 forks.watch()
@@ -44,9 +46,9 @@ _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
     "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
-    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Settings", "Smoothing", "Sweep", "Team", "apart", "box",
+    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Schedule", "Settings", "Smoothing", "Sweep", "Team", "apart", "box",
     "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "margins", "near", "outside", "resume", "run",
-    "solve", "sweep", "within",
+    "schedule", "solve", "sweep", "within",
 ]  # fmt: skip
 
 

@@ -11,6 +11,7 @@ degree 2 can only shrink the level sets.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -94,10 +95,7 @@ def with_auxiliary(team: Team, radius: float, center: ArrayLike | None = None) -
     agents = np.arange(team.count, dtype=np.int32)
     ends = np.cumsum(team.constraints_per_agent)
     moved = [
-        Family(
-            kind=family.kind, psi=family.psi, agents=family.agents, owner=family.owner, parameters=family.parameters, weight=family.weight,
-            sources=family.sources, number=(family.number + family.owner).astype(np.int32),
-        )
+        replace(family, number=(family.number + family.owner).astype(np.int32))
         for family in team.families
     ]  # fmt: skip
     added = Family(

@@ -59,7 +59,7 @@ def shape_of(team: Team) -> Shape:
     strict, quadratic, concave = np.zeros((3, count), dtype=bool)
     constant: list[Floats | None] = []
     for family in team.families:
-        readings = read_curvatures(family.psi, family.arity, team.dimension, family.parameters, family.size)
+        readings = read_curvatures(family.psi, family.arity, team.dimension, family.lasting, family.size)
         found, strict_in = once(readings.curvature), once(readings.strict_in)
         curvature[family.number] = found
         concave[family.number] = (found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)
@@ -70,7 +70,7 @@ def shape_of(team: Team) -> Shape:
 
 
 def _hessians(family: Family, dimension: int) -> Floats:
-    constant = hessians(family.psi, family.arity, dimension, family.parameters, family.size)
+    constant = hessians(family.psi, family.arity, dimension, family.lasting, family.size)
     alike = np.all(family.weight == family.weight[0])
     if alike and family.weight[0] == 1.0:
         return constant

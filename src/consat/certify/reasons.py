@@ -228,11 +228,11 @@ def turned(team: Team, knob: _Knob, amount: float) -> Team:
             changed[(int(np.argmax(here)), *knob.entry)] += knob.sign * amount
             families.append(dataclasses.replace(family, parameters={**family.parameters, knob.parameter: changed}))
         else:
-            single = _members(family, here)
+            single = family.members(here)
             slack = {**single.parameters, "slack": np.full(1, amount)}
             families.append(dataclasses.replace(single, psi=_Slackened(family.psi), parameters=slack, sources=None))
             if not here.all():
-                families.append(_members(family, ~here))
+                families.append(family.members(~here))
     return team.with_constraints(families, team.owner, team.names)
 
 
@@ -243,18 +243,10 @@ def restricted(team: Team, keep: Bools) -> Team:
     for family in team.families:
         members = keep[family.number]
         if members.any():
-            kept = _members(family, members)
+            kept = family.members(members)
             families.append(dataclasses.replace(kept, number=place[kept.number].astype(np.int32)))
     names = [team.names[k] for k in np.flatnonzero(keep).tolist()]
     return team.with_constraints(families, team.owner[keep], names)
-
-
-def _members(family: Family, members: Bools) -> Family:
-    sources = None if family.sources is None else [family.sources[m] for m in np.flatnonzero(members).tolist()]
-    return dataclasses.replace(
-        family, agents=family.agents[members], owner=family.owner[members], number=family.number[members], weight=family.weight[members],
-        parameters={key: value[members] for key, value in family.parameters.items()}, sources=sources,
-    )  # fmt: skip
 
 
 def _proposal(team: Team, knob: _Knob, amount: float) -> str:

@@ -141,6 +141,10 @@ def fingerprint(team: Team, *parts: Any) -> str:
         add((family.kind, family.arity, family.sources))
         for array in (family.agents, family.owner, family.weight, *(family.parameters[key] for key in sorted(family.parameters))):
             add(array)
+        for key in sorted(family.tracks):
+            add(key)
+            for array in family.tracks[key]:
+                add(array)
     return digest.hexdigest()
 
 

@@ -172,9 +172,8 @@ def _members(team: Team, local: np.ndarray, part: np.ndarray, me: int, count: in
         stop = start + len(chosen)
         made.append(
             dataclasses.replace(
-                family, agents=local[family.agents[chosen]].astype(np.int32), owner=owner[start:stop].astype(np.int32), sources=None,
-                number=rank[start:stop].astype(np.int32), weight=family.weight[chosen],
-                parameters={key: values[chosen] for key, values in family.parameters.items()},
+                family.members(chosen), agents=local[family.agents[chosen]].astype(np.int32), owner=owner[start:stop].astype(np.int32),
+                number=rank[start:stop].astype(np.int32), sources=None,
             )
         )  # fmt: skip
         start = stop

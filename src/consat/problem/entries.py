@@ -16,6 +16,7 @@ from consat.numerics import float64
 from consat.problem.constraints.record import Constraint
 from consat.problem.family import Part
 from consat.problem.parameters import Path
+from consat.problem.schedule import Schedule, Track
 
 SUGGESTIONS = 20
 """Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
@@ -33,6 +34,14 @@ class Entry:
     where: str
     values: dict[str, np.ndarray] = field(default_factory=dict)
     weight: float = 1.0
+    moving: dict[str, Schedule] = field(default_factory=dict)
+
+    def take(self, key: str, value: np.ndarray | Schedule) -> None:
+        """Set a parameter that has been checked."""
+        if isinstance(value, Schedule):
+            self.moving[key] = value
+            value = value.at(0.0)
+        self.values[key] = value
 
     @property
     def family(self) -> tuple[Any, ...]:
@@ -108,9 +117,18 @@ def alike(entries: Sequence[Entry]) -> list[Part]:
             names=tuple(entry.name for entry in group),
             sources=_sources(group),
             turn=np.array(turns[family]),
+            tracks=_tracks(group),
         )
         for family, group in members.items()
     ]
+
+
+def _tracks(entries: Sequence[Entry]) -> dict[str, Track]:
+    found: dict[str, dict[int, Schedule]] = {}
+    for row, entry in enumerate(entries):
+        for key, moving in entry.moving.items():
+            found.setdefault(key, {})[row] = moving
+    return {key: Track.of(each) for key, each in found.items()}
 
 
 def _sources(entries: Sequence[Entry]) -> tuple[str, ...] | None:

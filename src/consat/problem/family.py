@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
 import numpy as np
+
+from consat.problem.schedule import Track, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,7 @@ class Family:
         parameters: arrays with leading axis M.
         weight: (M,) positive factors on ψ.
         sources: (M,) the texts, if they were written as text expressions, else None.
+        tracks: how parameters move with time; `parameters` are then those at time 0.
     """
 
     kind: str
@@ -33,6 +36,33 @@ class Family:
     parameters: Mapping[str, np.ndarray]
     weight: np.ndarray
     sources: Sequence[str] | None = None
+    tracks: Mapping[str, Track] = field(default_factory=dict)
+
+    def members(self, which: np.ndarray) -> Family:
+        """Some of the constraints, by their places, ascending, or by a mask; numbered as before."""
+        rows = np.flatnonzero(which) if which.dtype == bool else which
+        return replace(
+            self, agents=self.agents[rows], owner=self.owner[rows], number=self.number[rows], weight=self.weight[rows],
+            parameters={key: value[rows] for key, value in self.parameters.items()},
+            sources=None if self.sources is None else Chosen(self.sources, rows), tracks=chosen(self.tracks, rows),
+        )  # fmt: skip
+
+    def at(self, time: float) -> Family:
+        """The constraints as they are at a time, s, and stay."""
+        return replace(self, parameters=self.parameters_at(time), tracks={}) if self.tracks else self
+
+    def parameters_at(self, time: float) -> Mapping[str, np.ndarray]:
+        """Arrays as `parameters`, at a time, s."""
+        return {
+            **self.parameters,
+            **{key: _written(self.parameters[key], track.rows, track.at(time)) for key, track in self.tracks.items()},
+        }
+
+    @property
+    def lasting(self) -> Mapping[str, np.ndarray]:
+        """The parameters, with NaN for those that move: what is proven of these, as of curvature, holds at all times."""
+        moving = {key: _written(self.parameters[key], track.rows, np.nan) for key, track in self.tracks.items()}
+        return {**self.parameters, **moving}
 
     @property
     def size(self) -> int:
@@ -56,6 +86,7 @@ class Part:
         weight: likewise.
         names: (M,) what reports call them.
         sources: likewise.
+        tracks: likewise.
         turn: (M,) where each was written among those of all parts that say; constraints of one owner keep that order. None: in the
             order of the parts, after those.
     """
@@ -69,6 +100,7 @@ class Part:
     names: Sequence[str]
     sources: Sequence[str] | None = None
     turn: np.ndarray | None = None
+    tracks: Mapping[str, Track] = field(default_factory=dict)
 
     @property
     def family(self) -> tuple[Any, ...]:
@@ -104,9 +136,30 @@ def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Seq
                 parameters={key: _joined([part.parameters[key] for part in group]) for key in first.parameters},
                 weight=_joined([part.weight for part in group]),
                 sources=Joined(texts) if len(texts) == len(group) else None,
+                tracks=_tracks(group),
             )
         )
     return tuple(families), owner if order is None else owner[order], names
+
+
+def _tracks(parts: Sequence[Part]) -> dict[str, Track]:
+    """How the parameters of parts that become one family move."""
+    starts = np.cumsum([0, *(len(part.owner) for part in parts)]).tolist()
+    found: dict[str, list[tuple[Track, int]]] = {}
+    for part, start in zip(parts, starts, strict=False):
+        for key, track in part.tracks.items():
+            found.setdefault(key, []).append((track, start))
+    nothing = np.zeros(0, dtype=np.int32)
+    return {
+        key: Track(nothing, many[0][0].times[:0], many[0][0].values[:0]).joined(many) if many[0][1] or len(many) > 1 else many[0][0]
+        for key, many in found.items()
+    }
+
+
+def _written(values: np.ndarray, rows: np.ndarray, new: Any) -> np.ndarray:
+    changed = np.array(values, dtype=float)
+    changed[rows] = new
+    return changed
 
 
 def _order(parts: Sequence[Part], owner: np.ndarray) -> np.ndarray | None:

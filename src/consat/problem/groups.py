@@ -25,6 +25,7 @@ from consat.errors import Fault, closest, shown
 from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
 from consat.problem.family import Counted, Derived, Part, Repeated
 from consat.problem.parameters import LARGEST, Path, checked, checked_rows, is_number
+from consat.problem.schedule import Schedule, Track
 
 Ints = NDArray[np.int64]
 
@@ -236,9 +237,19 @@ class Expansion:
             return None
         row, other = self.related(slots.relation, rows, path, where)
         columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in slots.reads]
-        values = {key: self.values(parameter, row, other, (*path, key), key, where) for key, parameter in constraint.parameters.items()}
+        values, tracks = {}, {}
+        for key, parameter in constraint.parameters.items():
+            value = self.values(parameter, row, other, (*path, key), key, where)
+            if isinstance(value, Schedule):
+                many = len(row)
+                times, places = (np.broadcast_to(each, (many, *each.shape)) for each in (value.times, value.values))
+                tracks[key] = Track(np.arange(many, dtype=np.int32), times, places)
+                value = np.broadcast_to(value.at(0.0), (many, *value.values.shape[1:]))
+            values[key] = value
         weight = self.values(Number(constraint.weight, positive=True), row, other, (*path, "weight"), "weight", where)
-        if len(self.faults) > known:
+        if isinstance(weight, Schedule):
+            self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
+        if len(self.faults) > known or isinstance(weight, Schedule):
             return None
         return Part(
             kind=constraint.kind,
@@ -249,6 +260,7 @@ class Expansion:
             weight=weight,
             names=(),
             sources=None if constraint.source is None else Repeated(constraint.source, len(row)),
+            tracks=tracks if len(row) else {},
         )
 
     def members(self, of: Any, path: Path, where: str) -> Ints:
@@ -365,8 +377,8 @@ class Expansion:
         itself[~itself.any(axis=1), -1] = True  # where places coincide it may not be among them
         return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
 
-    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray:
-        """(M, …) of one parameter; of no use if it has faults."""
+    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
+        """(M, …) of one parameter, or the schedule that all share; of no use if it has faults."""
         value, places = parameter.value, self.layout.places
         if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
             return places[row] - places[other - self.first] if key == "vector" else places[row]
@@ -374,6 +386,8 @@ class Expansion:
             rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
             return np.zeros(len(row)) if rows is None else rows
         one = checked(parameter, self.dimension, path, key, where, self.faults)
+        if isinstance(one, Schedule):
+            return one
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
 
     def told_apart(self, made: list[tuple[Part, Constraint, Path, str]]) -> list[tuple[Part, Constraint, Path, str]]:

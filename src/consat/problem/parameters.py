@@ -2,23 +2,114 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 
 from consat.errors import Fault, counted, shown
 from consat.problem.constraints.record import Fixed, Number, Parameter, Vector
+from consat.problem.schedule import KEYS, MOST_TIMES, Schedule
 
 LARGEST = 1e100
 """Numbers beyond this are refused: their squares must stay finite in float64."""
 
 Path = tuple[str | int, ...]
+Moving: TypeAlias = "np.ndarray | Schedule"
+"""What a parameter may be: an array, or arrays at times."""
 
 
-def checked(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    """The value of one parameter as an array; None, and a fault, if it may not be so."""
+def checked(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Moving | None:
+    """The value of one parameter as an array, or its schedule with arrays; None, and a fault, if it may not be so."""
+    moves = isinstance(parameter.value, Schedule | Mapping)
+    value = (scheduled if moves else still)(parameter, dimension, path, key, where, faults)
+    if value is not None and isinstance(parameter, Vector) and parameter.above is not None:
+        low = checked(Vector(parameter.above), dimension, (*path[:-1], "low"), "low", where, faults)
+        _require_above(value, low, path, key, where, faults)
+    return value
+
+
+def _require_above(value: Moving, low: Moving | None, path: Path, key: str, where: str, faults: list[Fault]) -> None:
+    times = np.unique(np.concatenate([np.zeros(1), *(each.times for each in (value, low) if isinstance(each, Schedule))]))
+    for time in times.tolist() if low is not None else []:
+        high, floor = (each.at(time) if isinstance(each, Schedule) else each for each in (value, low))
+        if high is not None and floor is not None and not np.all(high > floor):
+            when = f" at {time:g} s" if len(times) > 1 else ""
+            message = f"{key} is {high.tolist()}{when}, but must be above low {floor.tolist()} on every axis"
+            faults.append(Fault(path, message, where))
+            return
+
+
+def scheduled(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Schedule | None:
+    """A schedule, of whose values each is as the parameter may be."""
+    times, values = _schedule(parameter.value, path, key, where, faults)
+    if times is None or values is None:
+        return None
+    known = len(faults)
+    each = [
+        still(dataclasses.replace(parameter, value=value), dimension, (*path, "values", k), key, where, faults)
+        for k, value in enumerate(values)
+    ]
+    if len(faults) > known:
+        return None
+    found = [value for value in each if value is not None]
+    if any(value.shape != found[0].shape for value in found):
+        faults.append(Fault((*path, "values"), f"the values of {key} must have one shape throughout", where))
+        return None
+    made = Schedule(np.array(times, dtype=float), np.stack(found))
+    if isinstance(parameter, Vector) and parameter.nonzero and (k := _through_zero(made.values)) is not None:
+        message = f"{key} passes through zero between {times[k]:g} s and {times[k + 1]:g} s, but must point somewhere at all times"
+        faults.append(Fault((*path, "values", k + 1), message, where))
+        return None
+    return made
+
+
+def _schedule(value: Any, path: Path, key: str, where: str, faults: list[Fault]) -> tuple[list[float] | None, list[Any] | None]:
+    """The times and the values of a schedule, if these are lists of one length, and times are numbers that rise."""
+    example = f"{key}: {{times: [0, 10], values: [.., ..]}}"
+
+    def wrong(message: str, *at: str | int) -> tuple[None, None]:
+        faults.append(Fault((*path, *at), message, where))
+        return None, None
+
+    if isinstance(value, Mapping):
+        if unknown := [name for name in value if name not in KEYS]:
+            return wrong(f"a schedule has no key {shown(unknown[0])}; it has times and values, as in {example}", unknown[0])
+        if missing := [name for name in KEYS if name not in value]:
+            return wrong(f"{key} is a schedule without {missing[0]}; it has times and values, as in {example}")
+        value = Schedule(value["times"], value["values"])
+    both = (value.times, value.values)
+    times, values = (entries.tolist() if isinstance(entries, np.ndarray | jax.Array) else entries for entries in both)
+    for name, entries in zip(KEYS, (times, values), strict=True):
+        if not isinstance(entries, list | tuple) or not entries or len(entries) > MOST_TIMES:
+            return wrong(f"{name} of {key} is {shown(entries)}, but must be a list of 1 to {MOST_TIMES:,} entries, as in {example}", name)
+    if bad := [k for k, time in enumerate(times) if not is_number(time) or not abs(time) <= LARGEST]:
+        return wrong(f"times of {key} hold {shown(times[bad[0]])}, but must be finite numbers, s", "times", bad[0])
+    if bad := [k for k in range(1, len(times)) if not times[k] > times[k - 1]]:
+        message = f"times of {key} must rise, but {shown(times[bad[0]])} follows {shown(times[bad[0] - 1])}"
+        return wrong(message, "times", bad[0])
+    if len(values) != len(times):
+        message = f"{key} has {counted(len(times), 'time')} and {counted(len(values), 'value')}, but must have a value for each time"
+        return wrong(message, "values")
+    return [float(time) for time in times], list(values)
+
+
+def _through_zero(values: np.ndarray) -> int | None:
+    """The first of (K, d) vectors from which a straight line leads through zero to the next; None if none does."""
+    here, there = values[:-1], values[1:]
+    along = there - here
+    part = np.clip(-np.sum(here * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-300), 0.0, 1.0)
+    least = np.linalg.norm(here + part[:, None] * along, axis=1)
+    size = np.linalg.norm(here, axis=1) + np.linalg.norm(there, axis=1)
+    bad = np.flatnonzero(least <= 1e-12 * size)
+    return int(bad[0]) if len(bad) else None
+
+
+def still(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
+    """The value of a parameter that does not move."""
     if isinstance(parameter, Fixed):
         try:
             return np.asarray(parameter.value, dtype=float)
@@ -30,10 +121,6 @@ def checked(parameter: Parameter, dimension: int, path: Path, key: str, where: s
     value = vector(parameter.value, dimension, path, key, where, faults)
     if value is not None and parameter.nonzero and not np.any(value):
         faults.append(Fault(path, f"{key} is zero, but must point somewhere", where))
-    if value is not None and parameter.above is not None:
-        low = vector(parameter.above, dimension, (*path[:-1], "low"), "low", where, faults)
-        if low is not None and not np.all(value > low):
-            faults.append(Fault(path, f"{key} is {value.tolist()}, but must be above low {low.tolist()} on every axis", where))
     return value
 
 

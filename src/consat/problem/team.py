@@ -16,7 +16,7 @@ from consat.problem.constraints.record import OWNER, Constraint, Number, flatten
 from consat.problem.entries import SUGGESTIONS, Entry, alike, trace
 from consat.problem.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.problem.groups import Expansion, Group, faults_of, stems_clash
-from consat.problem.parameters import Path, checked, vector
+from consat.problem.parameters import Path, checked, still, vector
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -136,6 +136,21 @@ class Team:
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
 
+    @property
+    def moves(self) -> bool:
+        """Whether any constraint changes with time."""
+        return any(family.tracks for family in self.families)
+
+    def at(self, time: float) -> Team:
+        """The team with its constraints as they are at a time, s, and stay."""
+        return self.with_constraints([family.at(time) for family in self.families], self.owner, self.names) if self.moves else self
+
+    @property
+    def knots(self) -> np.ndarray:
+        """The times, s, at which schedules of its constraints begin, bend and end, rising; none of the clock's."""
+        found = [track.knots for family in self.families for track in family.tracks.values()]
+        return np.unique(np.concatenate([np.zeros(0), *found]))
+
     def with_links(self, links: np.ndarray) -> Team:
         """The same agents and constraints with other links, (L, 2), sorted."""
         team = copy.copy(self)
@@ -147,22 +162,22 @@ class Team:
         and the (M',) places that its constraints have in this one."""
         place = np.full(self.count, -1, dtype=np.int32)
         place[agents] = np.arange(len(agents), dtype=np.int32)
-        parts, kept = [], [np.zeros(0, dtype=np.int32)]
+        parts, numbers = [], [np.zeros(0, dtype=np.int32)]
         for family in self.families:
-            inside = np.flatnonzero((place[family.agents] >= 0).all(axis=1))
-            number = family.number[inside]
-            kept.append(number)
+            kept = family.members((place[family.agents] >= 0).all(axis=1))
+            numbers.append(kept.number)
             parts.append(
                 Part(
                     kind=family.kind,
                     psi=family.psi,
-                    agents=place[family.agents[inside]],
-                    owner=place[family.owner[inside]],
-                    parameters={key: value[inside] for key, value in family.parameters.items()},
-                    weight=family.weight[inside],
-                    names=Chosen(self.names, number),
-                    sources=None if family.sources is None else Chosen(family.sources, inside),
-                    turn=number,
+                    agents=place[kept.agents],
+                    owner=place[kept.owner],
+                    parameters=kept.parameters,
+                    weight=kept.weight,
+                    names=Chosen(self.names, kept.number),
+                    sources=kept.sources,
+                    turn=kept.number,
+                    tracks=kept.tracks,
                 )
             )
         team = copy.copy(self)
@@ -171,7 +186,7 @@ class Team:
         team.families, team.owner, team.names = assemble([part for part in parts if len(part.owner)])
         links = place[self.links]
         team.links = links[(links >= 0).all(axis=1)]
-        return team, np.sort(np.concatenate(kept))
+        return team, np.sort(np.concatenate(numbers))
 
     @property
     def count(self) -> int:
@@ -290,8 +305,8 @@ def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[Entr
                 for key, parameter in constraint.parameters.items():
                     value = checked(parameter, dimension, (*path, key), key, where, faults)
                     if value is not None:
-                        entry.values[key] = value
-                weight = checked(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
+                        entry.take(key, value)
+                weight = still(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
                 entry.weight = 1.0 if weight is None else float(weight)
                 if len(faults) == named and reads:
                     yield entry

@@ -18,6 +18,7 @@ from consat.errors import Fault, InvalidTeam
 from consat.problem.constraints import KINDS, OWNER, Constraint, box
 from consat.problem.family import Family
 from consat.problem.groups import Each, Group
+from consat.problem.schedule import Schedule
 from consat.problem.team import TOPOLOGIES, Team, topology
 from consat.scenario.document import resolve
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
@@ -119,14 +120,14 @@ def _group(group: Group, place: int, same_count: bool) -> dict[str, Any]:
 
 def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
     """The entry of a group's constraint; None if no file can hold it."""
-    values = {key: parameter.value for key, parameter in constraint.parameters.items()}
+    values = {key: _plain(parameter.value) for key, parameter in constraint.parameters.items()}
     arrays = [outer.of, outer.agent, *constraint.reads, *(values.values() if constraint.psi not in _SIDES else ())]
     if any(isinstance(value, np.ndarray) for value in arrays):
         return None
     if constraint.source is not None:
         entry: dict[str, Any] = {"kind": "expr", "psi": constraint.source} | ({} if outer.agent is None else {"agent": outer.agent})
     elif constraint.psi in _SIDES:
-        entry = _side(constraint.psi, {key: np.asarray(value, dtype=float) for key, value in values.items()})
+        entry = _side(constraint.psi, values)
     elif constraint.psi in _KIND_OF:
         entry = {"kind": _KIND_OF[constraint.psi]} | dict.fromkeys(["agent"] * (len(constraint.reads) - 1), constraint.reads[-1]) | values
     else:
@@ -137,11 +138,19 @@ def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
     return plain | ({} if outer.of is None else {"of": outer.of})
 
 
-def _side(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _side(psi: Callable[..., Any], parameters: Mapping[str, Any]) -> dict[str, Any]:
     """The side of a box, as the half-space it is."""
     sign, bound = _SIDES[psi]
-    normal = sign * parameters["axis"]
-    return {"kind": "halfspace", "normal": normal.tolist(), "offset": float(normal @ parameters[bound])}
+    normal, limit = sign * np.asarray(parameters["axis"], dtype=float), parameters[bound]
+    if isinstance(limit, Mapping):
+        offset: Any = {"times": limit["times"], "values": [float(normal @ np.asarray(value)) for value in limit["values"]]}
+    else:
+        offset = float(normal @ np.asarray(limit))
+    return {"kind": "halfspace", "normal": normal.tolist(), "offset": offset}
+
+
+def _plain(value: Any) -> Any:
+    return value.plain() if isinstance(value, Schedule) else value
 
 
 def write(data: Mapping[str, Any]) -> str:
@@ -153,12 +162,14 @@ def _constraints(team: Team, family: Family, chosen: np.ndarray) -> Iterator[dic
     """The entries of these members of a family; without ``kind`` if no file can hold them."""
     for k, number in zip(chosen.tolist(), family.number[chosen].tolist(), strict=True):
         parameters = {key: values[k].tolist() for key, values in family.parameters.items()}
+        moving = {key: track.schedule(k) for key, track in family.tracks.items()}
+        parameters |= {key: schedule.plain() for key, schedule in moving.items() if schedule is not None}
         reads = [team.ids[i] for i in family.agents[k]]
         entry: dict[str, Any] = {}
         if family.sources is not None:
             entry = {"kind": "expr", "psi": family.sources[k]}
         elif family.psi in _SIDES:
-            entry = _side(family.psi, {key: values[k] for key, values in family.parameters.items()})
+            entry = _side(family.psi, parameters)
         elif family.psi in _KIND_OF:
             entry = {"kind": _KIND_OF[family.psi]} | ({"agent": reads[1]} if len(reads) > 1 else {}) | parameters
         others = [agent for agent, i in zip(reads, family.agents[k], strict=True) if i != family.owner[k]]

@@ -177,13 +177,10 @@ def _restricted(team: Team, kept: Sequence[int]) -> Team:
 
 def _members(family: Family, which: np.ndarray, place: np.ndarray, numbers: np.ndarray) -> Family:
     return replace(
-        family,
+        family.members(which),
         agents=place[family.agents[which]],
         owner=place[family.owner[which]],
         number=np.searchsorted(numbers, family.number[which]).astype(np.int32),
-        parameters={key: value[which] for key, value in family.parameters.items()},
-        weight=family.weight[which],
-        sources=None if family.sources is None else tuple(family.sources[int(k)] for k in which),
     )
 
 

@@ -129,12 +129,12 @@ def read_curvatures(
         psi: as there.
         arity: as there.
         dimension: as there.
-        stacked_parameters: the keyword arguments, members along axis 0.
+        stacked_parameters: the keyword arguments, members along axis 0. What is proven holds whatever value stands where one is NaN.
         members: M; may be left out if there is a parameter.
     """
     family = _Family.of(psi, arity, dimension, stacked_parameters, members)
     nodes = family.nodes()
-    parts = [_classify(node, arity, count) for count, node in nodes]
+    parts = [_classify(node, arity, count, moving=family.moving) for count, node in nodes]
     code, strict_in = (stacked(part) for part in zip(*parts, strict=True))
     undecided = np.flatnonzero(code == _UNKNOWN)
     if undecided.size:
@@ -206,6 +206,11 @@ class _Family:
             raise ValueError(f"Argument psi must return one number, but {psi!r} returns {[str(var.aval) for var in trace.jaxpr.outvars]}.")
         return cls(psi, arity, dimension, parameters, members, trace)
 
+    @property
+    def moving(self) -> bool:
+        """Whether some parameters may take any value."""
+        return any(value.dtype.kind == "f" and bool(np.isnan(value).any()) for value in self.parameters.values())
+
     def nodes(self) -> list[tuple[int, Node]]:
         """What ψ is, chunk by chunk, with the number of members in the chunk."""
         size = max(1, CHUNK // (self.arity * self.dimension + 1) ** 2)
@@ -227,8 +232,8 @@ class _Family:
 
 
 @np.errstate(all="ignore")
-def _classify(node: Node, arity: int, members: int) -> tuple[Array, Array]:
-    """Codes (M,) and `strict_in` (M, arity) of a scalar node."""
+def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array]:
+    """Codes (M,) and `strict_in` (M, arity) of a scalar node; moving: whether terms that are NaN are those of parameters that move."""
     if node.terms is None:
         bend = node.bend
         strict = np.broadcast_to(bend.strict, (*bend.strict.shape[:-1], arity + 2))
@@ -239,8 +244,9 @@ def _classify(node: Node, arity: int, members: int) -> tuple[Array, Array]:
         largest = [signs(block(node.terms[2], slot), block(node.sizes[2], slot))[1] for slot in (None, *range(arity))]
         code, strict_in = np.choose(largest[0].astype(int) + 1, [_STRICTLY, _CONCAVE, _NOT]), np.stack(largest[1:], axis=-1) < 0
     finite = np.ones(1, bool)
-    for part in node.sizes:
-        finite = finite & np.isfinite(part).all(tuple(range(1, part.ndim)))
+    for order, part in enumerate(node.sizes):
+        good = ~np.isinf(part) if moving and order < 2 else np.isfinite(part)
+        finite = finite & good.all(tuple(range(1, part.ndim)))
     return _repeated(np.where(finite, code, _UNKNOWN), members), _repeated(strict_in & finite[:, None], members)
 
 

@@ -12,8 +12,8 @@ of numbers      ``sqrt exp log sin cos tan asin acos atan sinh cosh tanh square`
 ==============  ===========================================================================================================
 
 The value is a number, positive where the constraint holds, and reads at least one agent. Everything here, but ``norm`` at 0, is
-continuously differentiable inside its domain; hence no ``abs``, ``min``, ``max`` and comparisons. Functions and ``pi`` win over agents
-with the same id, which the quoted form reaches.
+continuously differentiable inside its domain; hence no ``abs``, ``min``, ``max`` and comparisons. ``t`` is the time in seconds. Functions,
+``pi`` and ``t`` win over agents with the same id, which the quoted form reaches.
 
 Nothing is ever executed: Python's parser yields a tree, `_Translator` admits what is listed above and refuses the rest, and `Formula`
 evaluates the outcome with `jax.numpy`. Literals are folded and then taken out of the tree, so that constraints with different
@@ -113,7 +113,7 @@ class _Node:
     """One operation on the values of its operands.
 
     Attributes:
-        operation: ``number``, ``agent``, or a key of `_OPERATIONS`.
+        operation: ``number``, ``agent``, ``time``, or a key of `_OPERATIONS`.
         operands: what it works on.
         details: of ``**`` the exponent, of a component its axis, of an agent its slot; of a number its value or, once lifted, its index.
         column: where it stands in the text; not part of the structure.
@@ -131,17 +131,18 @@ class Formula:
 
     tree: _Node
 
-    def __call__(self, *positions: ArrayLike, numbers: ArrayLike) -> Array:
+    def __call__(self, *positions: ArrayLike, numbers: ArrayLike, t: ArrayLike = 0.0) -> Array:
         """The value of ψ, a scalar.
 
         Args:
             positions: one (d,) array for each agent in `Expression.reads`, length.
             numbers: as many as in `Expression.numbers`, in that order.
+            t: the time, s.
 
         Raises:
             InvalidExpression: numbers and vectors are mixed up, or do not fit d.
         """
-        value = _evaluate(self.tree, [jnp.asarray(x) for x in positions], jnp.asarray(numbers))
+        value = _evaluate(self.tree, [jnp.asarray(x) for x in positions], jnp.asarray(numbers), jnp.asarray(t))
         if value.ndim:
             raise InvalidExpression(
                 "psi must be a number, but this is a vector; did you mean norm2(...), or a component such as a1.x?", self.tree.column
@@ -157,13 +158,15 @@ class Expression:
         text: as written.
         reads: the agents whose positions it takes, in order of first appearance.
         numbers: its literals after folding, with their sign, in order of appearance; exponents and axes belong to the structure instead.
-        function: ``function(*positions, numbers=numbers)`` is ψ, JAX-traceable.
+        function: ``function(*positions, numbers=numbers)`` is ψ, JAX-traceable; with ``t=time`` besides, if it moves.
+        moves: whether it reads the time.
     """
 
     text: str
     reads: tuple[str, ...]
     numbers: tuple[float, ...]
     function: Callable[..., Array]
+    moves: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Expression:
@@ -183,7 +186,7 @@ class Expression:
             raise InvalidExpression("the expression reads no agent, so no one can change it; use the position of its owner, e.g. norm2(a1)")
         numbers: list[float] = []
         function = Formula(_lift(tree, numbers))
-        return cls(text, tuple(translator.reads), tuple(numbers), function)
+        return cls(text, tuple(translator.reads), tuple(numbers), function, translator.moves)
 
 
 def _syntax(line: str) -> ast.expr:
@@ -221,6 +224,7 @@ class _Translator:
         self.reads: dict[str, int] = {}
         self.nodes = 0
         self.depth = 0
+        self.moves = False
 
     def translate(self, node: ast.expr) -> _Node:
         self.nodes += 1
@@ -250,6 +254,9 @@ class _Translator:
         name = self.segment(node)  # not node.id, where letters are normalised: they tell one agent from another
         if name in _FUNCTIONS:
             self.fault(node, f"{_usage(name)} is a function; an agent with this id is written '{name}'")
+        if name == "t":
+            self.moves = True
+            return _Node("time", column=self.column(node))
         return _number(math.pi, self.column(node)) if name == "pi" else self.agent(node, name)
 
     def agent(self, node: ast.expr, name: str) -> _Node:
@@ -375,12 +382,14 @@ def _lift(node: _Node, numbers: list[float]) -> _Node:
     return replace(node, operands=tuple(_lift(operand, numbers) for operand in node.operands))
 
 
-def _evaluate(node: _Node, positions: Sequence[Array], numbers: Array) -> Array:
+def _evaluate(node: _Node, positions: Sequence[Array], numbers: Array, t: Array) -> Array:
     if node.operation == "number":
         return numbers[node.details[0]]
     if node.operation == "agent":
         return positions[node.details[0]]
-    values = [_evaluate(operand, positions, numbers) for operand in node.operands]
+    if node.operation == "time":
+        return t
+    values = [_evaluate(operand, positions, numbers, t) for operand in node.operands]
     kinds = "".join("v" if value.ndim else "p" for value in values)
     operation = _OPERATIONS[node.operation]
     if not re.fullmatch(operation.takes, kinds):

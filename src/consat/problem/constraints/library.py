@@ -5,6 +5,7 @@ To add a kind, write the same two things and list the factory.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from consat.problem.constraints.expression import Expression
 from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
+from consat.problem.schedule import CLOCK, Schedule
 
 Other: TypeAlias = "str | int | Sequence[int] | Mapping[str, int] | np.ndarray"
 """Whom a constraint reads besides its owner."""
@@ -136,7 +138,9 @@ def box(low: ArrayLike, high: ArrayLike, *, name: str | None = None, weight: flo
         weight: positive factor on every ψ.
     """
     label = "box" if name is None else name
-    size = len(low) if isinstance(low, list | tuple) else np.size(low)
+    first = low.values if isinstance(low, Schedule) else low.get("values") if isinstance(low, Mapping) else [low]
+    side = first[0] if isinstance(first, list | tuple | np.ndarray) and len(first) else low
+    size = len(side) if isinstance(side, list | tuple) else np.size(side)
     axes = np.eye(min(max(size, 1), 64))  # a size that is not the team's dimension is for the team to refuse
     lows = [
         Constraint("box", _above, (OWNER,), {"low": Vector(low), "axis": Fixed(axis)}, f"{label}.low[{k}]", weight)
@@ -161,7 +165,10 @@ def expr(psi: str, *, name: str | None = None, weight: float = 1.0) -> Constrain
         InvalidExpression: the text is not in the language; says where and what would be.
     """
     parsed = Expression.parse(psi)
-    return Constraint("expr", parsed.function, parsed.reads, {"numbers": Fixed(parsed.numbers)}, name, weight, psi)
+    parameters: dict[str, Parameter] = {"numbers": Fixed(parsed.numbers)}
+    if parsed.moves:
+        parameters["t"] = Fixed(CLOCK)
+    return Constraint("expr", parsed.function, parsed.reads, parameters, name, weight, psi)
 
 
 def constraint(
@@ -175,10 +182,21 @@ def constraint(
         reads: the agents whose positions `psi` takes, in that order; the owner among them.
         name: what reports call it.
         weight: positive factor on ψ.
-        parameters: arrays that `psi` takes by keyword.
+        parameters: arrays that `psi` takes by keyword, or schedules of them. One that `psi` calls ``t``, and that is not given, is the
+            time, s.
     """
     kind = getattr(psi, "__name__", "constraint").strip("<>")
-    return Constraint(kind, psi, tuple(reads), {key: Fixed(value) for key, value in parameters.items()}, name, weight)
+    given: dict[str, Any] = {"t": CLOCK} if "t" not in parameters and _reads_time(psi, len(reads)) else {}
+    return Constraint(kind, psi, tuple(reads), {key: Fixed(value) for key, value in (parameters | given).items()}, name, weight)
+
+
+def _reads_time(psi: Callable[..., Any], positions: int) -> bool:
+    """Whether a function has, beside so many positions, an argument named ``t``."""
+    try:
+        arguments = list(inspect.signature(psi).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    return any(each.name == "t" and (k >= positions or each.kind is each.KEYWORD_ONLY) for k, each in enumerate(arguments))
 
 
 KINDS: Final[Mapping[str, Callable[..., Constraint | list[Constraint]]]] = {

@@ -339,11 +339,11 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
 def _form(family: Family, dimension: int) -> Form:
     from consat.problem.constraints.curvature import Curvature, read_curvatures
 
-    readings = read_curvatures(family.psi, family.arity, dimension, family.parameters, family.size)
+    readings = read_curvatures(family.psi, family.arity, dimension, family.lasting, family.size)
     found = once(readings.curvature)
     concave = bool(((found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)).all())
     try:
-        constant = once(hessians(family.psi, family.arity, dimension, family.parameters, family.size))
+        constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
     except ValueError:
         return Form(family.psi, None, concave, quadratic=False)
     if len(constant) != 1 or not np.isfinite(constant).all():

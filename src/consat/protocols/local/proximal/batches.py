@@ -257,7 +257,7 @@ def _own_first(slot: np.ndarray, own: np.ndarray) -> np.ndarray:
 def _bend(family: Family, dimension: int) -> Matrix | None:
     """−∇²ψ for weight 1, if it is the same for all members."""
     try:
-        constant = once(hessians(family.psi, family.arity, dimension, family.parameters, family.size))
+        constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
     except ValueError:
         return None
     if len(constant) != 1 or not np.isfinite(constant).all():
