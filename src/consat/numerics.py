@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
 
@@ -88,6 +88,11 @@ def taken(elements: Array, index: Array, empty: float) -> Array:
     last = len(elements) - 1
     there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
     return jnp.where(there, pick(elements, jnp.minimum(index, last)), empty)  # a copy with a filler behind it would cost as much again
+
+
+def laid_out(values: Mapping[str, Array], members: Array) -> dict[str, Array]:
+    """Parameters of a family, (M_f, …) each, as a batch holds them: (chunks, m, …, A) for members (chunks, m, A)."""
+    return {key: jnp.moveaxis(pick(jnp.asarray(array), members), 2, -1) for key, array in values.items()}
 
 
 @jax.tree_util.register_dataclass

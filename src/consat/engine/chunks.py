@@ -84,7 +84,7 @@ class Engine(Protocol):
         """The state before the first round, and what is seen of it."""
         ...
 
-    def advance(self, state: Any, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[Any, Chunk]:
+    def advance(self, state: Any, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[Any, Chunk]:
         """Some rounds.
 
         Args:
@@ -92,7 +92,7 @@ class Engine(Protocol):
             number: of the first of them.
             count: how many.
             streak: for how many rounds every margin has been positive, and for how many all have known what ends the run; the rounds end
-                when either are enough, if that ends the run.
+                when either are enough, if that ends the run. None while nothing does.
             every: each how manieth round to keep.
         """
         ...
@@ -101,8 +101,8 @@ class Engine(Protocol):
         """(N, d) everyone's positions."""
         ...
 
-    def look(self, state: Any) -> Kept:
-        """What is recorded of the state as it is."""
+    def look(self, state: Any, number: int) -> Kept:
+        """What is recorded of the state as it is, after so many rounds."""
         ...
 
     def agree(self, stop: bool) -> bool:
@@ -196,17 +196,19 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
     )
 
     def step(at: _Loop) -> _Loop:
-        now, seen, keep = _one(protocol, world, chosen, at.now, ask.number + at.done)
+        number = ask.number + at.done
+        here = world.at(number.astype(real) + 1.0)  # an agent's own constraints are those of the time for which it moves
+        now, seen, keep = _one(protocol, here, chosen, at.now, number)
         chunk = at.chunk
         drift = jnp.maximum(chunk.drift, jnp.max(jnp.abs(now.body - anchor), initial=0.0))
         numbers = {
             name: jax.lax.dynamic_update_index_in_dim(getattr(chunk, name), value, at.done, 0)
             for name, value in zip(SCALARS, seen, strict=True)
         }
-        count = chunk.violated + violated(world.observer, chosen.watched, now.body).astype(whole)
+        count = chunk.violated + violated(here.observer, chosen.watched, now.body).astype(whole)
         # what is not to be kept is overwritten by the next
         kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
-        places = jnp.where((ask.number + at.done + 1) % ask.every == 0, at.places + 1, at.places)
+        places = jnp.where((number + 1) % ask.every == 0, at.places + 1, at.places)
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
         known = seen[SCALARS.index("known")]
         near = jnp.where(known & ask.knowing > 0, chunk.near + 1, 0)
@@ -228,9 +230,9 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
     return now, tuple(getattr(seen, name) for name in SCALARS), chosen.of_seen(seen)
 
 
-def _look(world: World, chosen: Chosen, now: Now) -> Kept:
+def _look(world: World, chosen: Chosen, now: Now, number: Array) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world, now.state.x, now.body, (nothing, nothing), (nothing, nothing)))
+    return chosen.of_seen(see(world.at(number), now.state.x, now.body, (nothing, nothing), (nothing, nothing)))
 
 
 @functools.cache
@@ -269,9 +271,11 @@ class OneProcess:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)
         return _compiled(self._large)[0](self._protocol, self.world, self._chosen, first, key)
 
-    def advance(self, state: Now, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[Now, Chunk]:
-        hold, most = (NEVER, NEVER) if self._hold is None else self._hold
-        ask = Ask(*(jnp.asarray(value) for value in (number, count, streak[0], every, hold, most, streak[1], self._knowing)))
+    def advance(self, state: Now, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[Now, Chunk]:
+        hold, most = (NEVER, NEVER) if self._hold is None or streak is None else self._hold
+        knowing = 0 if streak is None else self._knowing
+        satisfied, near = streak or (0, 0)
+        ask = Ask(*(jnp.asarray(value) for value in (number, count, satisfied, every, hold, most, near, knowing)))
         return _compiled(self._large)[1](self._protocol, self.world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:
@@ -280,6 +284,6 @@ class OneProcess:
     def agree(self, stop: bool) -> bool:
         return stop
 
-    def look(self, state: Now) -> Kept:
-        kept = _compiled(self._large)[2](self.world, self._chosen, state)
+    def look(self, state: Now, number: int) -> Kept:
+        kept = _compiled(self._large)[2](self.world, self._chosen, state, jnp.asarray(float(number)))
         return Kept(*map(np.array, kept))

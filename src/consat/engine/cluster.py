@@ -128,7 +128,7 @@ class ManyProcesses:
         chunk = self._seen(book, now.body, np.zeros(1, dtype=int), 1)
         return _State(now, 0), chunk
 
-    def advance(self, state: _State, number: int, count: int, streak: tuple[int, int], every: int) -> tuple[_State, Chunk]:
+    def advance(self, state: _State, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[_State, Chunk]:
         now, run = state.now, _compiled()
         book = run.empty(now, jnp.asarray(self._rows.mine))
         for k in range(count):
@@ -140,7 +140,7 @@ class ManyProcesses:
         numbers = np.arange(number + 1, number + 1 + count)
         chunk = self._seen(book, state.now.body, np.flatnonzero(numbers % every == 0), count)
         if self._hold is not None:
-            satisfied = streak[0]
+            satisfied = 0 if streak is None else streak[0]
             for k, margin in enumerate(chunk.margin[:count]):
                 satisfied = satisfied + 1 if margin > 0 else 0
                 if satisfied >= self._hold and k + 1 < count:  # it ended within the chunk: go there again
@@ -179,7 +179,7 @@ class ManyProcesses:
     def agree(self, stop: bool) -> bool:
         return bool(self._gathered(jnp.asarray(float(stop))).any())
 
-    def look(self, state: _State) -> Kept:
+    def look(self, state: _State, number: int) -> Kept:
         book = _compiled().empty(state.now, jnp.asarray(self._rows.mine))
         book = _compiled().note(book, state.now, jnp.asarray(self._rows.mine), jnp.asarray(0))
         kept = self._seen(book, state.now.body, np.zeros(1, dtype=int), 1).kept

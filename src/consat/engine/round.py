@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.engine.live import Live
 from consat.numerics import Groups, pick
 from consat.problem.family import distinct
 from consat.problem.graphs import hops
@@ -185,6 +186,7 @@ class World:
         pairs: how many directed pairs.
         rough: whether messages can be lost or agents sleep.
         part: of which larger team this is a part; None of none.
+        live: what may change of the constraints; None where nothing does.
     """
 
     everyone: Everyone
@@ -199,6 +201,21 @@ class World:
     pairs: int = field(metadata={"static": True})
     rough: bool = field(metadata={"static": True})
     part: Part | None = None
+    live: Live | None = None
+
+    def at(self, round_: Array) -> World:
+        """With the constraints as they are after so many rounds."""
+        if self.live is None:
+            return self
+        values, everyone = self.live.at(round_), self.everyone
+        interior = everyone.interior if everyone.interior is None else replace(
+            everyone.interior, plan=everyone.interior.plan.with_parameters(values)
+        )  # fmt: skip
+        everyone = replace(
+            everyone, local=everyone.local.with_parameters(values), interior=interior,
+            plan=None if everyone.plan is None else everyone.plan.with_parameters(values),
+        )  # fmt: skip
+        return replace(self, everyone=everyone, observer=self.observer.with_parameters(values))
 
 
 class Now(NamedTuple):
@@ -415,16 +432,17 @@ def world_of(
     body: Body | None,
     speaks: str = "link",
     partial: bool = False,
+    live: Live | None = None,
 ) -> World:
     """Everything that does not change; arguments as in `consat.engine.rounds.simulate_rounds`; speaks: see `consat.protocols.Rounds`;
-    partial: whether it is of one process among several, which must know whose messages to count."""
+    partial: whether it is of one process among several, which must know whose messages to count; live: what may change."""
     receiver, sender, block = copies.ends()
     talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
         links=Ends.of(receiver, sender, block, copies.count),
         length=jnp.asarray(size.length),
         region=Region.of(size),
-        plan=prox.buckets(team, copies.rows, copies.count, convex) if speaks == "link" else None,
+        plan=prox.buckets(team, copies.rows, copies.count, convex, live=live is not None) if speaks == "link" else None,
         interior=Interior.of(team, copies, size) if speaks == "pair" else None,
         nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
@@ -454,6 +472,7 @@ def world_of(
         sleep=jnp.asarray(weather.sleep),
         pairs=len(pairs),
         rough=rough,
+        live=live,
     )
 
 

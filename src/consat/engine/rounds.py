@@ -13,6 +13,7 @@ import numpy as np
 from consat.engine import Stop
 from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
+from consat.engine.live import Live
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
 from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, World, world_of
@@ -58,6 +59,10 @@ class Tally(Steps):
         floats: sent.
         smooth_margin: the last.
         bound: the last.
+        held: after how many rounds, the start among them, every constraint held.
+        first_held: the first round after which every constraint held, or None.
+        held_since: after how many rounds from that one on they did.
+        worst_since: the least margin from that one on.
         asked: the round at which it was last asked whether there is hope.
         violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
     """
@@ -73,6 +78,10 @@ class Tally(Steps):
     asked: int = 0
     known: int = 0
     infeasible_from: int | None = None
+    held: int = 0
+    first_held: int | None = None
+    held_since: int = 0
+    worst_since: float = np.inf
     violated: Any = 0
 
     def add(self, chunk: Chunk) -> np.ndarray:
@@ -85,6 +94,7 @@ class Tally(Steps):
         if self.infeasible_from is None and len(torn):
             self.infeasible_from = int(numbers[torn[0]])
         self.known, self.near = int(known[-1]), int(chunk.near)
+        self._hold(numbers, margin)
         self.streak = self.streak + count if not len(bad) else count - 1 - int(bad[-1])
         self.last_bad = int(numbers[bad[-1]]) if len(bad) else self.last_bad
         self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
@@ -95,6 +105,26 @@ class Tally(Steps):
         self.margin, self.smooth_margin, self.bound = (float(leaf[count - 1]) for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound))
         self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
         return numbers
+
+    def motion(self, period: float) -> dict[str, Any]:
+        """Of ``run --json`` what is said of a team that moves; period: of a round, s."""
+        since = 0 if self.first_held is None else self.done + 1 - self.first_held
+        return {
+            "duration": self.done * period,
+            "satisfied_share": self.held / (self.done + 1),
+            "satisfied_share_after": self.held_since / since if since else None,
+            "worst_margin_after": self.worst_since if since else None,
+        }
+
+    def _hold(self, numbers: np.ndarray, margin: np.ndarray) -> None:
+        good = margin > 0
+        self.held += int(np.count_nonzero(good))
+        if self.first_held is None and good.any():
+            self.first_held = int(numbers[np.argmax(good)])
+        if self.first_held is not None:
+            since = margin[numbers >= self.first_held]
+            self.held_since += int(np.count_nonzero(since > 0))
+            self.worst_since = min(self.worst_since, float(since.min()))
 
 
 def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> float:
@@ -119,6 +149,7 @@ def simulate_rounds(
     *,
     convex: bool,
     rounds: int | None = None,
+    least: int = 0,
     stop: Stop = "satisfied",
     weather: Weather | None = None,
     body: Body | None = None,
@@ -141,6 +172,7 @@ def simulate_rounds(
         first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
         convex: whether every ψ is known to be concave.
         rounds: how many; `PATIENCE` if None.
+        least: rounds before which nothing ends the run, since constraints still move.
         stop: when to end earlier: every margin positive for `HOLD` rounds (or `hopeless` and settled); settled, or `enough`; or never.
         weather: loss and sleep; none if None.
         body: how fast positions follow estimates; at once if None.
@@ -162,12 +194,13 @@ def simulate_rounds(
         hold = HOLD if stop == "satisfied" else None
         engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
     else:
-        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
+        live = Live.of(team, 0.0 if body is None else 1.0 / body.rate, all_of_them=False)
+        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks, live=live)
         most = longest_hold(protocol, world)
         ends = (HOLD, most) if stop == "satisfied" else None
         engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
     rules = Rules(
-        end=PATIENCE if rounds is None else rounds, stop=stop, most=most, still=stillness(size.length, enough),
+        end=least + PATIENCE if rounds is None else rounds, least=least, stop=stop, most=most, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
         hopeless=hopeless, enough=enough,
     )  # fmt: skip
@@ -182,6 +215,7 @@ class Rules:
 
     Attributes:
         end: rounds at most.
+        least: rounds at least.
         stop: when to end earlier.
         most: how many satisfied rounds on end are the end, whether all know it or not.
         still: a chunk in which no position moved farther is one in which the team stood still, length.
@@ -194,6 +228,7 @@ class Rules:
     stop: Stop
     still: float
     most: int = HOLD
+    least: int = 0
     earliest: int = 0
     hopeless: Callable[[np.ndarray], bool] = lambda _: False
     enough: Callable[[np.ndarray], bool] | None = None
@@ -202,7 +237,7 @@ class Rules:
         """Why the run should end now, or None."""
         if np.isnan(tally.drift) or (tally.drift == np.inf and not np.isfinite(positions()).all()):
             return "diverged"
-        if self.stop == "never":
+        if self.stop == "never" or tally.done < self.least:
             return None
         if self.stop == "satisfied" and tally.streak >= HOLD and (tally.known & SATISFIED or tally.streak >= self.most):
             return "satisfied"
@@ -243,7 +278,10 @@ class _Course:
 
     def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
         done = self.tally.done
-        state, chunk = self._engine.advance(state, done, min(CHUNK, self.end - done), (self.tally.streak, self.tally.near), every)
+        least = self._rules.least
+        streak = (self.tally.streak, self.tally.near) if done >= least else None
+        count = min(CHUNK, (least if done < least else self.end) - done)
+        state, chunk = self._engine.advance(state, done, count, streak, every)
         rows = self._count(chunk, every)
         return state, rows, self._rules.ending(self.tally, functools.partial(self.positions, state))
 
@@ -257,7 +295,7 @@ class _Course:
     def look(self, state: Any) -> Rows:
         tally = self.tally
         margins = [np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound)]
-        return self._rows(np.array([tally.done]), margins, Kept(*(leaf[None] for leaf in self._engine.look(state))))
+        return self._rows(np.array([tally.done]), margins, Kept(*(leaf[None] for leaf in self._engine.look(state, tally.done))))
 
     def _rows(self, step: np.ndarray, margins: Sequence[np.ndarray], kept: Kept) -> Rows:
         margin, smooth_margin, bound = margins
@@ -274,6 +312,7 @@ class _Course:
             "floats_sent": tally.floats,
             **_known(tally),
             "period": self._period,
+            "motion": None if self._period is None else tally.motion(self._period),
             "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
         }
 

@@ -11,8 +11,8 @@ p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -165,6 +165,11 @@ class Objective:
     def at_positions(cls, team: Team) -> Objective:
         """The objectives evaluated at one shared (N, d) array of positions, as an observer of the whole team sees them."""
         return cls.of(team, lambda family: family.agents, team.count)
+
+    def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Objective:
+        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        batches = tuple(replace(batch, parameters={**batch.parameters, **own}) for batch, own in zip(self.batches, values, strict=True))
+        return replace(self, batches=batches)
 
     def _in_order(self, by_batch: Array) -> Array:
         return by_batch if self.order is None else by_batch[self.order]

@@ -17,12 +17,16 @@ from consat.problem.entries import SUGGESTIONS, Entry, alike, trace
 from consat.problem.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.problem.groups import Expansion, Group, faults_of, stems_clash
 from consat.problem.parameters import Path, checked, still, vector
+from consat.problem.schedule import FOREVER
 
 if TYPE_CHECKING:
     import networkx as nx
 
 MOST_NAMED = 100_000
 """Up to so many constraints have their names made at once; of more, a name is made when asked for."""
+
+INSTANTS = 12
+"""So many times tell where moving constraints lead, about."""
 
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
@@ -150,6 +154,17 @@ class Team:
         """The times, s, at which schedules of its constraints begin, bend and end, rising; none of the clock's."""
         found = [track.knots for family in self.families for track in family.tracks.values()]
         return np.unique(np.concatenate([np.zeros(0), *found]))
+
+    @property
+    def instants(self) -> list[Team]:
+        """The team at some times that tell where its constraints lead: where schedules bend, and where some read the time throughout its
+        first minute. One team if nothing moves."""
+        if not self.moves:
+            return [self]
+        knots = self.knots
+        reads_time = any((track.times[:, -1] >= FOREVER).any() for family in self.families for track in family.tracks.values())
+        times = np.concatenate([[0.0], knots[:: max(1, len(knots) // INSTANTS)], np.linspace(0.0, 60.0, INSTANTS) if reads_time else []])
+        return [self.at(time) for time in np.unique(times[times >= 0]).tolist()]
 
     def with_links(self, links: np.ndarray) -> Team:
         """The same agents and constraints with other links, (L, 2), sorted."""

@@ -84,8 +84,8 @@ class Region(NamedTuple):
 @functools.lru_cache(maxsize=16)
 @float64
 def scale(team: Team) -> Scale:
-    """Measure a team; 1 where nothing says otherwise. A team is measured once."""
-    measured = [_measure(family, team.dimension) for family in team.families]
+    """Measure a team; 1 where nothing says otherwise. A team is measured once; one that moves at several times together."""
+    measured = [_measure(family, team.dimension) for each in team.instants for family in each.families]
     psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
     bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
     slope = np.concatenate([np.zeros(0), *(m[2] for m in measured)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -43,6 +43,7 @@ class Trace:
         final: (N, d) everyone's last positions, where not all were recorded.
         violated: (M,) share of all steps, the start among them, at which each constraint was violated; NaN for those that are not watched,
             see `consat.engine.violations`; None where nobody counted.
+        motion: what is said of a team that moves, see ``run --json``; None in continuous time, and where rounds take no time.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -71,6 +72,7 @@ class Trace:
     violated: np.ndarray | None = None
     file: Path | None = None
     bound: np.ndarray | None = None
+    motion: Mapping[str, Any] | None = None
 
     @property
     def end(self) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
 from consat.protocols.estimates import Estimates, Layout
 from consat.protocols.local.interior import Way, route_of
+from consat.runs.options import Options
 from consat.scenario import Scenario, dump, load
 from consat.settings import ProtocolSettings, Settings, Start
 
@@ -69,21 +70,21 @@ def why_admm(team: Team, layout: Layout) -> str | None:
     return None
 
 
-def settings_of(asked: Settings, given: Mapping[str, Any], team: Team) -> Settings:
+def settings_of(asked: Settings, given: Options, team: Team) -> Settings:
     """What the scenario asks for, and `given` overrides; the default protocol is that whose gains are given, or that of the team.
 
     Raises:
         InvalidSettings: there is no such protocol.
     """
-    start, seed = given["start"], given["seed"]
-    estimates = given["estimates"] or asked.protocol.estimates
+    start, seed = given.start, given.seed
+    estimates = given.estimates or asked.protocol.estimates
     tuned = "admm" if asked.protocol.penalty is not None or asked.protocol.relaxation is not None else None
-    kind = given["protocol"] or asked.protocol.kind or tuned or default_protocol(team, estimates)
+    kind = given.protocol or asked.protocol.kind or tuned or default_protocol(team, estimates)
     settings = asked.model_copy(
         update={
             "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
             "protocol": asked.protocol.model_copy(update={"kind": kind, "estimates": estimates}),
-            "smoothing": given["smoothing"] or asked.smoothing,
+            "smoothing": given.smoothing or asked.smoothing,
         }
     )
     if kind not in FLOWS and kind not in ROUNDS:
@@ -147,12 +148,21 @@ class Prepared(NamedTuple):
 
     def hopeless(self, position: np.ndarray) -> bool:
         """Whether (N, d) positions prove that no formation satisfies every constraint."""
-        return bounds(self.team, position, self.schedule.final).verdict == "infeasible"
+        return bounds(self.at_the_end, position, self.schedule.final).verdict == "infeasible"
+
+    @property
+    def at_the_end(self) -> Team:
+        """The team once its schedules have ended."""
+        return self.team.at(float(self.team.knots.max(initial=0.0)))
 
     @property
     def enough(self) -> Callable[[np.ndarray], bool] | None:
         """Says of (N, d) positions whether no formation is better by more than a tolerance; None where nobody asks."""
-        return (lambda position: _gap(self.team, position) <= SHARP * self.size.psi) if self.settings.protocol.kind == "max-min" else None
+        return (
+            (lambda position: _gap(self.at_the_end, position) <= SHARP * self.size.psi)
+            if self.settings.protocol.kind == "max-min"
+            else None
+        )
 
 
 def _gap(team: Team, position: np.ndarray) -> float:

@@ -5,19 +5,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import numpy as np
 
 from consat.engine import Stop
 from consat.engine import checkpoint as checkpoints
 from consat.engine.files import Files, claim
 from consat.engine.flows import simulate_flow
 from consat.engine.recording import Choice, Who
-from consat.engine.round import Body, Weather
 from consat.engine.rounds import simulate_rounds
 from consat.errors import InvalidSettings
 from consat.numerics import float64
@@ -26,6 +24,7 @@ from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Estimates, Layout
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
+from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
@@ -66,13 +65,13 @@ def run(
         seed: of the random starts and first estimates, and of what gets lost.
         start: ``(low, high)`` of the box they are drawn from, numbers or (d,) arrays, length.
         smoothing: ν_α and ν_β, or ``auto``.
-        until: end of a flow, s; implies ``stop="never"``.
+        until: end of the run, s, in rounds together with `rate`; implies ``stop="never"``.
         rounds: number of rounds; implies ``stop="never"``.
         stop: ``satisfied`` (default), ``converged`` or ``never``.
         loss: probability that a message is lost, in rounds.
         sleep: probability that an agent skips a round.
-        rate: rounds a second, Hz, for a body that cannot jump; positions then follow estimates.
-        speed: the most that such a body moves, length/s.
+        rate: rounds a second, Hz; by default `consat.runs.options.RATE` where constraints move with time, else rounds take no time.
+        speed: the most that a body moves, length/s; positions then follow estimates. Without, bodies are where their agents want to be.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         record: whether to keep all estimates and integral states; by default while they are few.
         agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
@@ -91,18 +90,17 @@ def run(
         InvalidScenario: the scenario has faults.
         InvalidSettings: the settings do not fit together, or `out` cannot be written to or holds results of another scenario.
     """
-    given = {
-        "protocol": protocol, "estimates": estimates, "seed": seed, "start": start, "smoothing": smoothing,
-        "until": until, "rounds": rounds, "stop": stop, "loss": loss, "sleep": sleep, "rate": rate, "speed": speed,
-        "auxiliary": auxiliary, "record": record, "agents": agents, "every": every,
-    }  # fmt: skip
+    options = Options(
+        protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
+        loss=loss, sleep=sleep, rate=rate, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
+    )  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
     scenario = scenario_of(team)
     if out is not None:
         claim(Path(out), scenario.name, force=force)
     files = None if out is None else Files(Path(out), checkpoint)
-    return _start(scenario, given, files, full, progress)
+    return _start(scenario, options, files, full, progress)
 
 
 def resume(
@@ -131,76 +129,52 @@ def resume(
     """
     files = Files(Path(out), checkpoint, checkpoints.read(Path(out) / checkpoints.NAME))
     about = files.about
-    given = dict(about["given"]) | {key: value for key, value in (("rounds", rounds), ("until", until)) if value is not None}
-    if given["smoothing"] not in (None, "auto"):
-        given["smoothing"] = Smoothing.model_validate(given["smoothing"])
+    changed: dict[str, Any] = {key: value for key, value in (("rounds", rounds), ("until", until)) if value is not None}
+    options = dataclasses.replace(Options.of(about["given"]), **changed)
     if team is None and not about["scenario"]:
         raise InvalidSettings(f"{out}: the team of this run holds Python functions; give resume the same team")
     scenario = scenario_of(team) if team is not None else loads(about["scenario"], about["name"])
-    return _start(scenario, given, files, full, progress)
+    return _start(scenario, options, files, full, progress)
 
 
-def _start(
-    scenario: Scenario, given: Mapping[str, Any], files: Files | None, full: bool, progress: Callable[[float, float], None]
-) -> Result:
-    """Check the settings, and run; `given` are the arguments of `run`."""
-    about = {
-        "scenario": scenario.text,
-        "scenario_name": scenario.name,
-        "name": scenario.source,
-        "given": {key: _as_data(value) for key, value in given.items()},
-    }
-    if given["auxiliary"] is not None:
-        scenario = with_auxiliary(scenario, given["auxiliary"])
-    settings = settings_of(scenario.settings, given, scenario.team)
-    kind = settings.protocol.kind
-    until, rounds, loss, sleep, rate, speed = (given[key] for key in ("until", "rounds", "loss", "sleep", "rate", "speed"))
-    default = "never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied"
-    options: dict[str, Any] = {"stop": given["stop"] or default, "progress": progress}
-    if jax.process_count() > 1 and (kind in FLOWS or (files is not None and files.checkpoints(about) is not None)):
-        raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
-    keep = _Keep(given["agents"], given["record"], given["every"], files, about)
+def _start(scenario: Scenario, options: Options, files: Files | None, full: bool, progress: Callable[[float, float], None]) -> Result:
+    """Check the settings, and run."""
+    about = {"scenario": scenario.text, "scenario_name": scenario.name, "name": scenario.source, "given": options.data}
+    if options.auxiliary is not None:
+        scenario = with_auxiliary(scenario, options.auxiliary)
+    team = scenario.team
+    settings = settings_of(scenario.settings, options, team)
+    kind = str(settings.protocol.kind)
+    if jax.process_count() > 1:
+        _require_simple(kind, team, files is not None and files.checkpoints(about) is not None)
+    keep = _Keep(options, files, about)
+    how: dict[str, Any] = {"stop": options.stop_for(kind), "progress": progress}
     if kind in FLOWS:
-        _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
-        return _run(scenario, settings, full, keep, functools.partial(_flow, until=until, **options))
-    _refuse(f"protocol {kind} goes in rounds; use rounds", until=until)
-    if (speed is not None and rate is None) or not all(value is None or value > 0 for value in (speed, rate)):
-        raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
-    if not (0 <= loss < 1 and 0 <= sleep < 1):
-        raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
-    weather = Weather(loss, sleep, settings.start.seed)
-    body = None if rate is None else Body(rate, np.inf if speed is None else speed)
-    simulate = functools.partial(_rounds, rounds=rounds, weather=weather, body=body, **options)
-    return _run(scenario, settings, full, keep, simulate)
+        options.require_flow(kind, team)
+        return _run(scenario, settings, full, keep, functools.partial(_flow, until=options.until, **how))
+    pace, weather = options.pace(kind, team), options.weather(settings.start.seed)
+    return _run(scenario, settings, full, keep, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
 
 
-def _as_data(value: Any) -> Any:
-    """An argument of `run` as JSON can hold it."""
-    if isinstance(value, Smoothing):
-        return value.model_dump(by_alias=True)
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return value if isinstance(value, str) or not isinstance(value, Sequence) else [_as_data(each) for each in value]
-
-
-def _refuse(why: str, **given: float | None) -> None:
-    if wrong := [name for name, value in given.items() if value]:
-        raise InvalidSettings(f"{why}; {', '.join(wrong)} means nothing to it")
+def _require_simple(kind: str, team: Team, checkpoints: bool) -> None:
+    """What several processes can do."""
+    if kind in FLOWS or checkpoints:
+        raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
+    if team.moves:
+        raise InvalidSettings("constraints move with time, which several processes do not follow; use one")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Keep:
-    """What is kept of a run, and where; `agents`, `record` and `every` as in `run`, `about` what `resume` must know."""
+    """What is kept of a run, and where; `about` is what `resume` must know."""
 
-    agents: Who
-    record: bool | None
-    every: int
+    asked: Options
     files: Files | None
     about: Mapping[str, Any]
 
     def options(self, team: Team, copies: Estimates, clock: str) -> dict[str, Any]:
         """Arguments of `simulate_rounds` and `simulate_flow`."""
-        choice = Choice.of(team, copies, self.agents, self.record, self.every)
+        choice = Choice.of(team, copies, self.asked.agents, self.asked.record, self.asked.every)
         if self.files is None or jax.process_index() > 0:  # process 0 writes for all
             return {"choice": choice}
         return {"choice": choice, "sink": self.files.sink(team, copies, choice, clock), "checkpoint": self.files.checkpoints(self.about)}

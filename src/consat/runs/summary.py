@@ -15,6 +15,7 @@ from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.results.trace import Trace
 from consat.runs.advice import warnings_of
+from consat.runs.verdicts import verdicts
 from consat.scenario import Scenario
 from consat.settings import Settings
 
@@ -29,7 +30,8 @@ NEARLY = 1e-3
 
 def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
     """What ``run --json`` prints (schema consat.run/1)."""
-    team, position = scenario.team, trace.end
+    whole, position = scenario.team, trace.end
+    team = whole.at(float(trace.steps[-1]) * (trace.period or 1.0))
     nu = schedule.final
     margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
     margin = float(margins.min(initial=np.inf))
@@ -62,6 +64,8 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
         "agents": _agents(team, margins, multipliers, trace.violated) if listed else None,
         "clusters": _clusters(team, trace.cluster) if listed else None,
+        "motion": trace.motion,
+        "verdicts": _verdicts(whole, trace) if whole.moves else None,
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
         "warnings": warnings_of(
@@ -70,6 +74,20 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
     }
+
+
+def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:
+    """What is certified over the time of a run."""
+    period = trace.period or 1.0
+    recorded = trace.recorded is None and trace.file is None
+
+    def seen(time: float) -> np.ndarray | None:
+        if not recorded:
+            return None
+        k = int(np.searchsorted(trace.steps * period, time + 0.5 * period)) - 1
+        return np.asarray(trace.position[max(k, 0)])
+
+    return verdicts(team, float(trace.steps[-1]) * period, seen)
 
 
 def status_of(ending: str, margin: float, upper: float | None, psi: float) -> str:

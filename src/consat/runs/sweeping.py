@@ -26,6 +26,7 @@ from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
+from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.runs.runner import run
 from consat.runs.summary import number, status_of
@@ -159,15 +160,17 @@ def sweep(
     over = {} if over is None else {path: list(options) for path, options in over.items()}
     if empty := [path for path, options in over.items() if not options]:
         raise InvalidSettings(f"no values are given for {empty[0]}; give some, such as {empty[0]}=1,2,3")
-    given = {"protocol": protocol, "estimates": estimates, "start": start, "seed": None, "smoothing": None}
-    asked = _Asked(scenario, given, rounds, until, stop, loss, sleep, auxiliary)
+    asked = _Asked(scenario, Options(
+        protocol=protocol, estimates=estimates, start=start, rounds=rounds, until=until, stop=stop, loss=loss, sleep=sleep,
+        auxiliary=auxiliary,
+    ))  # fmt: skip
     first = scenario.settings.start.seed
     numbers = list(range(first, first + seeds)) if isinstance(seeds, int) else [int(seed) for seed in seeds]
     if not numbers:
         raise InvalidSettings("there are no seeds; give at least one")
     combinations = list(asked.combinations(over))
     kinds = {each.ready.settings.protocol.kind for each in combinations}
-    if kinds & FLOWS.keys():
+    if kinds & FLOWS.keys() or any(each.ready.team.moves for each in combinations):
         rows = list(asked.one_by_one(combinations, numbers, progress))
     else:
         rows = asked.together(combinations, numbers, progress)
@@ -194,13 +197,7 @@ class _Asked:
     """What all runs share."""
 
     scenario: Scenario
-    given: Mapping[str, Any]
-    rounds: int | None
-    until: float | None
-    stop: Stop | None
-    loss: float
-    sleep: float
-    auxiliary: float | None
+    options: Options
 
     def combinations(self, over: Mapping[str, Sequence[Any]]) -> Iterator[_Combination]:
         """Every combination of the values, the last path's values changing fastest."""
@@ -213,16 +210,16 @@ class _Asked:
             overrides = [f"{path}={json.dumps(chosen[path])}" for path in of_scenario]
             if (key := json.dumps(overrides)) not in made:
                 made[key] = self._prepared(overrides)
-            loss, sleep = (_probability(name, chosen.get(name, getattr(self, name))) for name in OF_A_RUN)
+            loss, sleep = (_probability(name, chosen.get(name, getattr(self.options, name))) for name in OF_A_RUN)
             yield _Combination(chosen, made[key], (loss, sleep))
 
     def _prepared(self, overrides: Sequence[str]) -> Prepared:
         scenario = loads(self.scenario.text, self.scenario.source, overrides) if overrides else self.scenario
-        if self.auxiliary is not None:
-            scenario = with_auxiliary(scenario, self.auxiliary)
-        settings = settings_of(scenario.settings, self.given, scenario.team)
-        kind = settings.protocol.kind
-        if (kind in FLOWS and (self.rounds or self.loss or self.sleep)) or (kind in ROUNDS and self.until):
+        if self.options.auxiliary is not None:
+            scenario = with_auxiliary(scenario, self.options.auxiliary)
+        settings = settings_of(scenario.settings, self.options, scenario.team)
+        kind, asked = settings.protocol.kind, self.options
+        if (kind in FLOWS and (asked.rounds or asked.loss or asked.sleep)) or (kind in ROUNDS and asked.until and not scenario.team.moves):
             raise InvalidSettings(
                 f"protocol {kind} is none to which all of these settings mean anything: until is for flows, the rest for rounds"
             )
@@ -270,9 +267,8 @@ class _Asked:
         world = world_of(
             ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks
         )
-        default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
         rules = Rules(
-            end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,
+            end=PATIENCE if self.options.rounds is None else self.options.rounds, stop=self.options.stop_for(str(asked.kind)),
             most=longest_hold(protocol, world), still=stillness(ready.size.length, ready.enough),
             earliest=protocol.earliest(world.everyone), hopeless=ready.hopeless, enough=ready.enough,
         )  # fmt: skip
@@ -289,9 +285,9 @@ class _Asked:
             result = run(
                 scenario,
                 seed=seed,
-                rounds=self.rounds,
-                until=self.until,
-                stop=self.stop,
+                rounds=self.options.rounds,
+                until=self.options.until,
+                stop=self.options.stop,
                 loss=loss,
                 sleep=sleep,
                 agents="none",

@@ -7,8 +7,8 @@ back to it through others, unless several variables go round a loop together; wh
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -18,7 +18,7 @@ from jax import Array
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from consat.numerics import once
+from consat.numerics import laid_out, once
 from consat.problem.constraints.curvature import hessians
 from consat.problem.family import Family, distinct
 from consat.problem.graphs import middles
@@ -77,6 +77,7 @@ class Batch:
         shared: (chunks, g, p, A) which of their variables they share with each, the level being number n·d; padded with n·d + 1.
         kinds: their constraints, a family each.
         forms: what is known of these beforehand.
+        families: which family of the team each kind is, and the place among the multipliers at which this begins.
     """
 
     agents: Array
@@ -86,6 +87,18 @@ class Batch:
     shared: Array
     kinds: tuple[Kind, ...]
     forms: tuple[Form, ...] = field(metadata={"static": True})
+    families: tuple[tuple[int, int], ...] = field(metadata={"static": True})
+
+    def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Batch:
+        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        kinds, start = [], 0
+        for kind, (family, offset) in zip(self.kinds, self.families, strict=True):
+            m = kind.used.shape[1]
+            own, members = values[family], self.members[:, start : start + m] - offset
+            last = min((len(array) for array in own.values()), default=1) - 1
+            kinds.append(kind._replace(parameters={**kind.parameters, **laid_out(own, jnp.clip(members, 0, last))}))
+            start += m
+        return replace(self, kinds=tuple(kinds))
 
 
 @jax.tree_util.register_dataclass
@@ -101,7 +114,8 @@ class Plan:
         pair: (P,) of each end of a link.
         floats: (P,) how many numbers a message over each end holds.
         width: variables that two neighbours share, at most.
-        exact: whether what agents share travels along trees: then nothing that one has said comes back to it through others.
+        exact: whether what agents share travels along trees, so that nothing that one has said comes back to it through others, and no
+            constraint moves: then what they tell adds up to a proof.
     """
 
     batches: tuple[Batch, ...]
@@ -112,6 +126,10 @@ class Plan:
     floats: Array
     width: int = field(metadata={"static": True})
     exact: bool = field(metadata={"static": True})
+
+    def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Plan:
+        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        return replace(self, batches=tuple(batch.with_parameters(values) for batch in self.batches))
 
 
 @dataclass(frozen=True)
@@ -278,7 +296,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        jnp.asarray(floats), int(size.max(initial=1)), shared.exact,
+        jnp.asarray(floats), int(size.max(initial=1)), shared.exact and not team.moves,
     )  # fmt: skip
 
 
@@ -308,8 +326,8 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
         value = np.where(shared.row[take] < 0, n * d, slot[shared.row[take]] * d + axis)
         variables[nth[shared.pair[take]], within[take] + axis, who[take]] = value
 
-    kinds, kept, members = [], [], []
-    for family, form, offset in zip(team.families, forms, start[:-1], strict=True):
+    kinds, kept, members, families = [], [], [], []
+    for number, (family, form, offset) in enumerate(zip(team.families, forms, start[:-1].tolist(), strict=True)):
         mine = np.flatnonzero(place[family.owner] >= 0)
         if not len(mine):
             continue
@@ -330,10 +348,11 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
             jnp.asarray(used[None]),
         ))  # fmt: skip
         kept.append(form)
+        families.append((number, offset))
         members.append(np.where(used, offset + index, start[-1]).astype(np.int32))
     stacked = np.concatenate([np.zeros((0, A), dtype=np.int32), *members])
     arrays = [jnp.asarray(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
-    return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept))
+    return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept), tuple(families))
 
 
 def _form(family: Family, dimension: int) -> Form:

@@ -8,7 +8,7 @@ padded to a common shape instead, which compiles once.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import once
+from consat.numerics import laid_out, once
 from consat.problem.constraints.curvature import hessians
 from consat.problem.constraints.domain import Extended, extended
 from consat.problem.family import Family, distinct
@@ -45,11 +45,13 @@ class Form:
         psi: the function.
         slots: for each of an agent's constraints which of its rows ψ takes; None where that varies.
         bend: −∇²ψ, (arity·d)², for weight 1; None where it varies.
+        family: which family of the team it is.
     """
 
     psi: Callable[..., Any]
     slots: tuple[tuple[int, ...], ...] | None
     bend: Matrix | None
+    family: int
 
 
 class Kind(NamedTuple):
@@ -60,12 +62,14 @@ class Kind(NamedTuple):
         parameters: (chunks, m, …, A).
         weight: (chunks, m, A); None if all are 1.
         used: (chunks, m, A) false where padded; None if nothing is.
+        members: (chunks, m, A) places in the family; None where parameters stay what they are.
     """
 
     slots: Array | None
     parameters: Mapping[str, Array]
     weight: Array | None
     used: Array | None
+    members: Array | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -110,8 +114,18 @@ class Plan:
     agent: Array
     agents: int = field(metadata={"static": True})
 
+    def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Plan:
+        """The same with other parameters; of each family those that are given, (M_f, …). For a plan made for it."""
 
-def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, convex: bool) -> Plan:
+        def changed(kind: Kind, form: Form) -> Kind:
+            own = values[form.family]
+            return kind if kind.members is None or not own else kind._replace(parameters={**kind.parameters, **laid_out(own, kind.members)})
+
+        kinds = [tuple(map(changed, batch.kinds, batch.forms)) for batch in self.batches]
+        return replace(self, batches=tuple(replace(batch, kinds=own) for batch, own in zip(self.batches, kinds, strict=True)))
+
+
+def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, convex: bool, *, live: bool = False) -> Plan:
     """Sort the agents that have constraints into batches.
 
     Args:
@@ -119,6 +133,7 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
         row: gives the row of the copy (holder, position).
         count: how many rows there are.
         convex: whether every ψ is known to be concave.
+        live: whether parameters may change; see `Plan.with_parameters`.
     """
     sizes = np.stack([np.bincount(family.owner, minlength=team.count) for family in team.families], axis=1) if team.families else None
     made: list[_Made] = []
@@ -129,7 +144,7 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
         for group in patterns:
             others[group.agents] = False
         for group in [*patterns, *_padded(team, sizes, np.flatnonzero(others))]:
-            made.append(_made(team, group, bends, row, count))
+            made.append(_made(team, group, bends, row, count, live=live))
     rows, agents = np.full(count, -1, dtype=np.int32), np.full(team.count, -1, dtype=np.int32)
     row_start = agent_start = 0
     batches = []
@@ -278,7 +293,7 @@ class _Made:
         return Batch(jnp.asarray(self.agents), jnp.asarray(self.rows), self.kinds, self.forms, known, convex, partial)
 
 
-def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callable[..., np.ndarray], count: int) -> _Made:
+def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callable[..., np.ndarray], count: int, *, live: bool) -> _Made:
     agents, n = len(group.agents), len(group.positions)
     width = min(max(SQUARE // (n * team.dimension) ** 2, NARROWEST), WIDEST)
     chunks = -(-agents // width)
@@ -299,7 +314,7 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
     else:
         rows[there] = row(holder[there], group.positions[there])
     kinds, forms = [], []
-    for family, members, slots, bend in zip(team.families, group.members, group.slots, bends, strict=True):
+    for number, (family, members, slots, bend) in enumerate(zip(team.families, group.members, group.slots, bends, strict=True)):
         if not members.shape[1]:
             continue
         used = members >= 0
@@ -311,8 +326,9 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
                 {key: jnp.asarray(cut(np.moveaxis(value[index], 0, -1))) for key, value in family.parameters.items()},
                 None if (weight == 1.0).all() else jnp.asarray(cut(weight.T)),
                 None if used.all() else jnp.asarray(cut(used.T)),
+                jnp.asarray(cut(index.T.astype(np.int32))) if live else None,
             )
         )
         psi = extended(family.psi, family.arity, team.dimension, family.parameters)
-        forms.append(Form(psi, tuple(map(tuple, slots.tolist())) if slots.ndim == 2 else None, bend))
+        forms.append(Form(psi, tuple(map(tuple, slots.tolist())) if slots.ndim == 2 else None, bend, number))
     return _Made(cut(group.agents.astype(np.int32)), cut(rows), tuple(kinds), tuple(forms))

@@ -1,0 +1,122 @@
+"""How a run is asked for: the arguments of `run`, checked, as one frozen object that a checkpoint can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+
+from consat.engine import Stop
+from consat.engine.recording import Who
+from consat.engine.round import Body, Weather
+from consat.errors import InvalidSettings
+from consat.problem.team import Team
+from consat.protocols.estimates import Layout
+from consat.settings import Smoothing
+
+RATE = 20.0
+"""Rounds a second, Hz, where constraints move with time and nobody says."""
+WATCHED = 60.0
+"""s; how long a team is followed whose constraints read the time, when nobody says."""
+
+
+class Pace(NamedTuple):
+    """How rounds follow one another.
+
+    Attributes:
+        rounds: how many; None until a stop rule says so.
+        least: how many before a stop rule may say so.
+        body: what moves in a round; None where rounds take no time.
+    """
+
+    rounds: int | None
+    least: int
+    body: Body | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """See `consat.run`."""
+
+    protocol: str | None = None
+    estimates: Layout | None = None
+    seed: int | None = None
+    start: tuple[Any, Any] | None = None
+    smoothing: Smoothing | Literal["auto"] | None = None
+    until: float | None = None
+    rounds: int | None = None
+    stop: Stop | None = None
+    loss: float = 0.0
+    sleep: float = 0.0
+    rate: float | None = None
+    speed: float | None = None
+    auxiliary: float | None = None
+    record: bool | None = None
+    agents: Who = None
+    every: int = 1
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """As JSON can hold them."""
+        return {field.name: _as_data(getattr(self, field.name)) for field in dataclasses.fields(self)}
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Self:
+        """From `data`."""
+        smoothing = data["smoothing"]
+        return cls(**{**data, "smoothing": smoothing if smoothing in (None, "auto") else Smoothing.model_validate(smoothing)})
+
+    def stop_for(self, kind: str) -> Stop:
+        """When a run with a protocol ends before the time or the rounds are up."""
+        if self.stop is not None:
+            return self.stop
+        if self.until is not None or self.rounds is not None:
+            return "never"
+        return "converged" if kind == "max-min" else "satisfied"
+
+    def require_flow(self, kind: str, team: Team) -> None:
+        """Raises: InvalidSettings: there is something that continuous time does not know."""
+        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "rate", "speed")}
+        if wrong := [name for name, value in given.items() if value]:
+            message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
+            raise InvalidSettings(message)
+        if team.moves:
+            raise InvalidSettings(f"constraints move with time, and protocol {kind} flows without rounds; use a protocol in rounds")
+
+    def weather(self, seed: int) -> Weather:
+        """What goes wrong on the way. Raises: InvalidSettings: probabilities that are none."""
+        if not (0 <= self.loss < 1 and 0 <= self.sleep < 1):
+            raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
+        return Weather(self.loss, self.sleep, seed)
+
+    def pace(self, kind: str, team: Team) -> Pace:
+        """How rounds follow one another. Raises: InvalidSettings: what is said of it does not fit together."""
+        rate = RATE if self.rate is None and team.moves else self.rate
+        if (self.speed is not None and rate is None) or not all(value is None or value > 0 for value in (self.speed, rate)):
+            raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
+        body = None if rate is None else Body(rate, np.inf if self.speed is None else self.speed)
+        if self.until is None:
+            knots = team.knots
+            horizon = float(knots.max()) if len(knots) else WATCHED
+            least = math.ceil(horizon * body.rate) if body is not None and team.moves and self.rounds is None else 0
+            return Pace(self.rounds, least, body)
+        if self.rounds is not None:
+            raise InvalidSettings("until and rounds both say when the run ends; use one of them")
+        if body is None:
+            message = f"protocol {kind} goes in rounds; use rounds; until means something to it together with rate, rounds a second"
+            raise InvalidSettings(message)
+        if not (math.isfinite(self.until) and self.until >= 0):
+            raise InvalidSettings(f"until is {self.until}, but must be a time, s")
+        return Pace(round(self.until * body.rate), 0, body)
+
+
+def _as_data(value: Any) -> Any:
+    if isinstance(value, Smoothing):
+        return value.model_dump(by_alias=True)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if isinstance(value, str) or not isinstance(value, Sequence) else [_as_data(each) for each in value]

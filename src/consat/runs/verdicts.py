@@ -1,0 +1,119 @@
+"""Verdicts over time: what an observer can certify of a team whose constraints move, at sampled times.
+
+A verdict is proven at each sampled time. Between two neighbouring times with the same verdict the team is said to have it, too; where they
+differ the change is looked for by halving the gap, and what is left of it is undecided.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from consat.certify.certificate import bounds
+from consat.certify.optimum import max_min
+from consat.problem.objective import margins
+from consat.problem.team import Team
+
+SAMPLES = 120
+"""Times at which a run is looked at, beside those at which schedules bend."""
+COSTLY = 2000
+"""Times, times agents, that are certified at most; larger teams are looked at less often."""
+NARROWED = 6
+"""So often a gap between two different verdicts is halved."""
+
+Verdict = Literal["feasible", "infeasible", "undecided"]
+
+
+class Instant(NamedTuple):
+    """What is certified at one time, s.
+
+    Attributes:
+        time: s.
+        verdict: see `consat.certify.certificate.Certificate`.
+        lower: a margin that a formation has.
+        upper: proven bound on the best margin; None if nothing is proven.
+    """
+
+    time: float
+    verdict: Verdict
+    lower: float
+    upper: float | None
+
+
+def verdicts(
+    team: Team, duration: float, seen: Callable[[float], np.ndarray | None], progress: Callable[[float], None] = lambda _: None
+) -> list[dict[str, Any]]:
+    """Intervals that cover a run, for ``run --json``: ``from``, ``to``, s, ``verdict``, and ``bounds`` over the interval.
+
+    Args:
+        team: whose constraints move.
+        duration: of the run, s.
+        seen: the (N, d) positions in the run at about a time, which may satisfy everybody; None where they are not recorded.
+        progress: called with the fraction done.
+    """
+    samples = int(np.clip(COSTLY // max(team.count, 1), 8, SAMPLES))
+    knots = team.knots[(team.knots > 0) & (team.knots < duration)]
+    times = np.unique(np.concatenate([np.linspace(0.0, duration, samples + 1), knots])) if duration > 0 else np.zeros(1)
+    found = []
+    for k, time in enumerate(times.tolist()):
+        found.append(certify(team, time, seen(time)))
+        progress((k + 1) / len(times))
+    return intervals(_narrowed(team, found, seen))
+
+
+def certify(team: Team, time: float, x: np.ndarray | None) -> Instant:
+    """What is proven at one time: at once if the (N, d) formation x satisfies everybody, else centrally."""
+    here = team.at(time)
+    if x is not None and np.isfinite(x).all() and (lower := float(margins(here, x).min(initial=np.inf))) > 0:
+        return Instant(time, "feasible", lower, None)
+    best = max_min(here)
+    found = bounds(here, best.positions, refine=not best.exact, multipliers=best.multipliers)
+    return Instant(time, found.verdict, found.lower, found.upper)
+
+
+def _narrowed(team: Team, found: Sequence[Instant], seen: Callable[[float], np.ndarray | None]) -> list[Instant]:
+    """With further times where the verdict changes."""
+    whole = [found[0]]
+    for before, after in itertools.pairwise(found):
+        low, high = before, after
+        for _ in range(NARROWED if before.verdict != after.verdict else 0):
+            between = certify(team, 0.5 * (low.time + high.time), seen(0.5 * (low.time + high.time)))
+            if between.verdict == low.verdict:
+                low = between
+            elif between.verdict == high.verdict:
+                high = between
+            else:
+                break
+        whole += [each for each in (low, high) if each.time > whole[-1].time]
+        if whole[-1].time < after.time:
+            whole.append(after)
+    return whole
+
+
+def intervals(found: Sequence[Instant]) -> list[dict[str, Any]]:
+    """Neighbouring times with one verdict become one interval; between different ones nothing is decided."""
+    groups: list[list[Instant]] = [[found[0]]]
+    for each in found[1:]:
+        if each.verdict == groups[-1][-1].verdict:
+            groups[-1].append(each)
+        else:
+            groups.append([each])
+    told: list[dict[str, Any]] = []
+    for k, group in enumerate(groups):
+        if k:
+            _say(told, groups[k - 1][-1].time, group[0].time, "undecided", [groups[k - 1][-1], group[0]])
+        _say(told, group[0].time, group[-1].time, group[0].verdict, group)
+    return told
+
+
+def _say(told: list[dict[str, Any]], start: float, stop: float, verdict: Verdict, over: Sequence[Instant]) -> None:
+    if told and told[-1]["verdict"] == verdict:
+        told[-1]["to"] = stop
+        return
+    uppers = [each.upper for each in over]
+    upper = None if any(each is None for each in uppers) else max(each for each in uppers if each is not None)
+    lower = min(each.lower for each in over)
+    told.append({"from": start, "to": stop, "verdict": verdict, "bounds": [lower if np.isfinite(lower) else None, upper]})
