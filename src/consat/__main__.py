@@ -1,5 +1,5 @@
 """``python -m consat``."""
 
-from consat.cli.main import main
+from consat.cli import main
 
 main()

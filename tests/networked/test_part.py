@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from consat.cli.main import cli
+from consat.cli.commands import cli
 from consat.errors import InvalidScenario, InvalidSettings, InvalidTeam
 from consat.network.node.part import Part, read_part, split, write_part
 from consat.network.node.problem import Alone, ends

@@ -21,7 +21,7 @@ from tests.networked.case_c import GOAL
 from tests.networked.oracle import ROUNDS
 
 ROOT = Path(__file__).parents[2]
-CONSAT = [sys.executable, "-c", "from consat.cli.main import main; main()"]
+CONSAT = [sys.executable, "-c", "from consat.cli import main; main()"]
 START = 90.0
 """A process has so long to start, or to end with what it has to say, s, on a busy machine."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import consat as cs
-from consat.cli.main import cli, main
+from consat.cli.commands import cli, main
 from consat.views import animation
 
 

@@ -1,1 +1,5 @@
-"""The command line: words in and words out, no mathematics. `main` has the commands of one process, `network` those of many."""
+"""The command line: words in and words out, no mathematics. `commands` has those of one process, `network` those of many."""
+
+from consat.cli.commands import main
+
+__all__ = ["main"]

@@ -1,4 +1,4 @@
-"""What the commands of `consat.cli.main` and of `consat.network` have in common: arguments, exit codes, and how a run is told."""
+"""What all commands have in common: arguments, exit codes, and how a run is told."""
 
 from __future__ import annotations
 

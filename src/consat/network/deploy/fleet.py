@@ -83,7 +83,7 @@ class Fleet:
         if agent in self._children:
             self._bury(self._children.pop(agent))
         command = [
-            sys.executable, "-c", "from consat.cli.main import main; main()", "agent", str(self.file(agent)), "--id", agent, "--attached",
+            sys.executable, "-c", "from consat.cli import main; main()", "agent", str(self.file(agent)), "--id", agent, "--attached",
             *self.options, *options,
         ]  # fmt: skip
         pipe = subprocess.PIPE
