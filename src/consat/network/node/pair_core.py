@@ -37,13 +37,11 @@ class PairState(NamedTuple):
 
     Attributes:
         inner: of the protocol.
-        changes: the largest count heard of, or its own.
         bounds: (2,) the best of so many turns before, and since.
         turns: taken.
     """
 
     inner: InteriorState
-    changes: Array
     bounds: Array
     turns: Array
 
@@ -84,11 +82,12 @@ class PairCore:
     def carry(self, other: Core, state: PairState, first: np.ndarray) -> PairState:
         """Only the estimates live on, and the count of changes, which this is one of."""
         fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)))
-        return fresh._replace(changes=state.changes + 1.0)
+        memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
+        return fresh._replace(inner=fresh.inner._replace(memory=memory))
 
 
 def _begin(protocol: InteriorPoint, solver: Alone, first: Array) -> PairState:
-    return _strong(PairState(protocol.start(first, solver), jnp.zeros(()), jnp.full(2, jnp.inf), jnp.zeros(())))
+    return _strong(PairState(protocol.start(first, solver), jnp.full(2, jnp.inf), jnp.zeros(())))
 
 
 def _strong(state: PairState) -> PairState:
@@ -108,17 +107,7 @@ def _turn(
     (inbox, arrived, fresh), (round_, margin) = heard, moment
     interior = solver.interior
     assert interior is not None
-    told, mail = packing.unpack(inbox, interior.plan.width)
-    changes = jnp.maximum(state.changes, jnp.max(jnp.where(arrived, told, 0.0), initial=0.0))
-    news = changes > state.changes
-    nothing, inner = interior.silence().proof, state.inner
-
-    def choose(where: Array, new: Any, old: Any) -> Any:
-        return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
-
-    before = inner.inbox._replace(proof=choose(news, nothing, inner.inbox.proof))
-    mail = mail._replace(proof=choose(told == changes, mail.proof, nothing))
-    inner = protocol.hear(inner._replace(inbox=before), mail, arrived, solver)
+    inner = protocol.hear(state.inner, packing.unpack(inbox, interior.plan.width), arrived, solver)
     inner = inner._replace(
         memory=inner.memory._replace(bound=jnp.full(1, jnp.inf)),
         inbox=inner.inbox._replace(margin=jnp.where(fresh, inner.inbox.margin, -jnp.inf)),
@@ -126,11 +115,11 @@ def _turn(
     own = jnp.asarray(margin)[None]
     inner, message = protocol.speak(inner, solver, round_, Known(jnp.zeros(1), own))
     (bound,), (least,) = protocol.proven(inner, solver, own)
-    older, since = jnp.where(news, jnp.inf, state.bounds)
+    older, since = jnp.where(inner.memory.changes > state.inner.memory.changes, jnp.inf, state.bounds)
     since = jnp.minimum(since, bound)
     full = (state.turns + 1.0) % FORGET == 0
     bounds = jnp.where(full, jnp.stack([since, jnp.full_like(since, jnp.inf)]), jnp.stack([older, since]))
-    return _strong(PairState(inner, changes, bounds, state.turns + 1.0)), packing.pack(changes, message), jnp.min(bounds), least
+    return _strong(PairState(inner, bounds, state.turns + 1.0)), packing.pack(message), jnp.min(bounds), least
 
 
 @functools.cache

@@ -129,27 +129,27 @@ class Packing:
         """W."""
         return self.out.shape[1]
 
-    def pack(self, changes: Array, mail: Mail) -> Array:
-        """(G, W) from a count and the mail."""
+    def pack(self, mail: Mail) -> Array:
+        """(G, W) from the mail."""
         count = len(self.out)
         proof = mail.proof
         leaves = (
-            jnp.broadcast_to(changes, (count,)), mail.barrier, mail.level, mail.margin, proof.weight, proof.constant, proof.error,
+            mail.changes, mail.barrier, mail.level, mail.margin, proof.weight, proof.constant, proof.error,
             mail.matrix, mail.vector, proof.matrix, proof.vector,
         )  # fmt: skip
         rows = [leaf.reshape(count, math.prod(leaf.shape[1:])) for leaf in leaves]
         flat = jnp.concatenate([*rows, jnp.zeros((count, 1))], axis=1)
         return jnp.take_along_axis(flat, self.out, axis=1)
 
-    def unpack(self, packed: Array, width: int) -> tuple[Array, Mail]:
-        """(G,) counts and the mail."""
+    def unpack(self, packed: Array, width: int) -> Mail:
+        """The mail."""
         count = len(self.back)
         flat = jnp.take_along_axis(jnp.concatenate([packed, jnp.zeros((count, 1))], axis=1), self.back, axis=1)
         cut = _Flat(width)
         numbers = [flat[:, k] for k in range(HEAD + TAIL)]
         changes, barrier, level, margin, weight, constant, error = numbers
         matrix, vector, slope, force = (flat[:, begin:end].reshape(count, *shape) for begin, end, shape in cut.arrays)
-        return changes, Mail(matrix, vector, barrier, level, margin, Proof(slope, force, constant, weight, error))
+        return Mail(matrix, vector, barrier, level, margin, changes, Proof(slope, force, constant, weight, error))
 
 
 class _Flat(NamedTuple):

@@ -76,7 +76,7 @@ class Interior:
         """The mail before anything was said; leading axis P."""
         p, pairs = self.plan.width, len(self.talker)
         matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
-        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, Proof(matrix, vector, number, number - 1.0, number))
+        return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, number, Proof(matrix, vector, number, number - 1.0, number))
 
     def across(self, mail: Mail) -> Mail:
         """What stands at the other ends."""
@@ -114,7 +114,7 @@ class Interior:
                 return found[(slice(None), *[slice(p)] * (values.ndim - 1))]
 
             heard = Mail(
-                at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf),
+                at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf), at(inbox.changes),
                 Proof(*map(at, inbox.proof)),
             )  # fmt: skip
             found, mail = step.act(

@@ -292,8 +292,8 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
             offset += flat.size
         where[name] = jnp.asarray(place)
     places = size - np.bincount(shared.pair, weights=shared.row < 0, minlength=len(shared.pairs)).astype(np.int64)
-    # a quadratic with barrier, level and margin, and a proof with its constant, weight and error
-    floats = size * (size + 3) // 2 + 3 + places * (places + 3) // 2 + 3
+    # a quadratic with barrier, level, margin and a count of changes, and a proof with its constant, weight and error
+    floats = size * (size + 3) // 2 + 4 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
         jnp.asarray(floats), int(size.max(initial=1)), shared.exact and not team.moves,

@@ -70,6 +70,7 @@ class Memory(NamedTuple):
         inertia: κ_i, as a multiple of the protocol's.
         swing: the last step, along a direction that stays the same.
         warm: rounds left in which it maximises the mean of its margins.
+        changes: the largest count of changed constraints, its own or heard of: proofs speak of the constraints that it counts.
     """
 
     y: Array
@@ -82,6 +83,7 @@ class Memory(NamedTuple):
     inertia: Array
     swing: Array
     warm: Array
+    changes: Array
 
 
 class Proof(NamedTuple):
@@ -111,6 +113,7 @@ class Mail(NamedTuple):
         barrier: (g,) μ; negative where nothing is said of the level.
         level: (g,) t.
         margin: (g,) the least margin of all behind the sender.
+        changes: (g,) the sender's count of changes; see `Memory`.
         proof: see there.
     """
 
@@ -119,6 +122,7 @@ class Mail(NamedTuple):
     barrier: Array
     level: Array
     margin: Array
+    changes: Array
     proof: Proof
 
 
@@ -290,7 +294,9 @@ def begin(lanes: Lanes, y: Array, gains: Gains) -> Memory:
     psi = lanes.psi(y)
     number = jnp.zeros(y.shape[-1])
     violated = (jnp.min(psi[:-1], axis=0, initial=jnp.inf) < -gains.far) & lanes.quadratic
-    return Memory(y, *centered(lanes, psi), number + jnp.inf, number, number + 1.0, number, jnp.where(violated, float(gains.warm), 0.0))
+    return Memory(
+        y, *centered(lanes, psi), number + jnp.inf, number, number + 1.0, number, jnp.where(violated, float(gains.warm), 0.0), number
+    )
 
 
 def placed(lanes: Lanes, y: Array) -> Array:
@@ -351,6 +357,9 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     """
     n, d, count = memory.y.shape
     size = n * d + 1
+    changes = jnp.maximum(memory.changes, jnp.max(inbox.changes, axis=0, initial=0.0))
+    best = jnp.where(changes > memory.changes, jnp.inf, memory.bound)
+    proofs = inbox.proof._replace(weight=jnp.where(inbox.changes == changes[None], inbox.proof.weight, -1.0))
     some = lanes.used[:-1].any(axis=0)
     outside, pull = spread(inbox.matrix, inbox.vector, shared, size)
     said = inbox.barrier >= 0
@@ -418,7 +427,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
         left, e = left * places[:, :, None] * places[:, None], e * places
     fine &= jnp.isfinite(left).all(axis=(1, 2)) & jnp.isfinite(e).all(axis=1)
     speaks = (some | jnp.isfinite(lowest)) & ~warm
-    proof, bound = prove(lanes, shared, held, y, here=here, multiplier=multiplier, inbox=inbox.proof)
+    proof, bound = prove(lanes, shared, held, y, here=here, multiplier=multiplier, inbox=proofs)
     behind = _least_of_others(jnp.concatenate([told[None], inbox.margin]))[1:]
     mail = Mail(
         jnp.where(fine[:, None, None], left, 0.0),
@@ -426,10 +435,11 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
         jnp.where(speaks[None], barrier[None], -1.0) + jnp.zeros(fine.shape),
         level[None] + jnp.zeros(fine.shape),
         behind,
+        changes[None] + jnp.zeros(fine.shape),
         proof,
     )
     after = Memory(
-        y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(memory.bound, bound), memory.age + 1, inertia, swing, rest
+        y, multiplier[:-1], multiplier[-1], level, barrier, jnp.minimum(best, bound), memory.age + 1, inertia, swing, rest, changes
     )
     return after, mail
 
