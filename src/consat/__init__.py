@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from consat.problem.team import Agent, Team
     from consat.results.result import Result
     from consat.runs.runner import resume, run
+    from consat.runs.session import Session
     from consat.runs.solving import solve
     from consat.runs.sweeping import Sweep, sweep
     from consat.scenario import Scenario, dump, load, loads
@@ -33,6 +34,7 @@ _HOME = {
     "problem.objective": ("margins",),
     "results.result": ("Result",),
     "runs.runner": ("resume", "run"),
+    "runs.session": ("Session",),
     "runs.solving": ("solve",),
     "runs.sweeping": ("Sweep", "sweep"),
     "scenario": ("Scenario", "dump", "load", "loads"),
@@ -46,9 +48,9 @@ _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
     "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
-    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Schedule", "Settings", "Smoothing", "Sweep", "Team", "apart", "box",
-    "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "margins", "near", "outside", "resume", "run",
-    "schedule", "solve", "sweep", "within",
+    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Schedule", "Session", "Settings", "Smoothing", "Sweep", "Team",
+    "apart", "box", "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "margins", "near", "outside",
+    "resume", "run", "schedule", "solve", "sweep", "within",
 ]  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -315,6 +315,11 @@ class _Course:
             "motion": None if self._period is None else tally.motion(self._period),
             "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
         }
+
+
+def known_of(tally: Tally) -> Literal["satisfied", "infeasible"] | None:
+    """What all agents know."""
+    return "satisfied" if tally.known & SATISFIED else "infeasible" if tally.known & INFEASIBLE else None
 
 
 def _known(tally: Tally) -> Mapping[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.errors import Fault, InvalidTeam, closest, shown
-from consat.problem.constraints.record import OWNER, Constraint, Number, flatten
+from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, flatten
 from consat.problem.entries import SUGGESTIONS, Entry, alike, trace
 from consat.problem.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.problem.groups import Expansion, Group, faults_of, stems_clash
@@ -139,6 +139,32 @@ class Team:
         team.__dict__.pop("constraints_per_agent", None)
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
+
+    @property
+    def agents(self) -> tuple[Agent, ...]:
+        """Its agents with their constraints, from which the same team can be made again; those of groups one by one."""
+        own: list[list[tuple[int, Constraint]]] = [[] for _ in range(self.count)]
+        for family in self.families:
+            for k in range(family.size):
+                i, number = int(family.owner[k]), int(family.number[k])
+                own[i].append((number, self._constraint(family, k, i, number)))
+        return tuple(
+            Agent(agent, [each for _, each in sorted(constraints, key=lambda pair: pair[0])], None if np.isnan(start).any() else start)
+            for agent, constraints, start in zip(self.ids, own, self.starts, strict=True)
+        )
+
+    def _constraint(self, family: Family, k: int, owner: int, number: int) -> Constraint:
+        moving = {key: track.schedule(k) for key, track in family.tracks.items()}
+        values = {key: moving.get(key) or value[k] for key, value in family.parameters.items()}
+        reads = tuple(OWNER if i == owner else self.ids[i] for i in family.agents[k].tolist())
+        source = None if family.sources is None else family.sources[k]
+        parameters = {key: Fixed(value) for key, value in values.items()}
+        return Constraint(family.kind, family.psi, reads, parameters, self.names[number], float(family.weight[k]), source)
+
+    @property
+    def linked(self) -> list[tuple[str, str]]:
+        """The links as pairs of ids."""
+        return [(self.ids[i], self.ids[j]) for i, j in self.links.tolist()]
 
     @property
     def moves(self) -> bool:

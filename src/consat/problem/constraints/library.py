@@ -6,7 +6,7 @@ To add a kind, write the same two things and list the factory.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from consat.problem.constraints.expression import Expression
+from consat.problem.constraints.expression import Expression, Formula
 from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, Parameter, Vector
 from consat.problem.schedule import CLOCK, Schedule
 
@@ -197,6 +197,28 @@ def _reads_time(psi: Callable[..., Any], positions: int) -> bool:
     except (TypeError, ValueError):
         return False
     return any(each.name == "t" and (k >= positions or each.kind is each.KEYWORD_ONLY) for k, each in enumerate(arguments))
+
+
+_POINT, _LENGTH = Vector(None), Number(None, positive=True)
+ADJUSTABLE: Final[Mapping[Callable[..., Any], Mapping[str, Parameter]]] = {
+    _within: {"center": _POINT, "radius": _LENGTH},
+    _outside: {"center": _POINT, "radius": _LENGTH},
+    _near: {"radius": _LENGTH},
+    _apart: {"radius": _LENGTH},
+    _displacement: {"vector": _POINT, "radius": _LENGTH},
+    _halfspace: {"normal": Vector(None, nonzero=True), "offset": Number(None)},
+    _above: {"low": _POINT},
+    _below: {"high": _POINT},
+}
+"""Of every function of the library the parameters that can be changed, and what these may be. None of them changes how it bends."""
+
+
+def adjustable(psi: Callable[..., Any], parameters: Iterable[str]) -> Mapping[str, Parameter]:
+    """Which of its parameters can be changed in a constraint, and what these may be; none in a text expression, where numbers have no
+    names."""
+    if isinstance(psi, Formula):
+        return {}
+    return ADJUSTABLE[psi] if psi in ADJUSTABLE else {key: Fixed(None) for key in parameters if key != "t"}
 
 
 KINDS: Final[Mapping[str, Callable[..., Constraint | list[Constraint]]]] = {

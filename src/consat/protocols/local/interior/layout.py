@@ -271,7 +271,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # up to 8, 32, 128, …
     if count * max(degree.max(initial=0), 1) * (held.max(initial=0) * d + 1) ** 2 <= ALIKE:
         power[:] = 0
-    forms = [_form(family, d) for family in team.families]
+    forms = [form_of(family, d) for family in team.families]
     start = np.cumsum([0, *(family.size for family in team.families)])
     slot = np.arange(copies.count) - first[copies.holder]  # the own copy first, the others in order
     mine = slot[copies.own]
@@ -355,7 +355,8 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
     return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept), tuple(families))
 
 
-def _form(family: Family, dimension: int) -> Form:
+def form_of(family: Family, dimension: int) -> Form:
+    """What is known beforehand of the constraints of a family."""
     from consat.problem.constraints.curvature import Curvature, read_curvatures
 
     readings = read_curvatures(family.psi, family.arity, dimension, family.lasting, family.size)

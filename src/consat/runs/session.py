@@ -1,0 +1,645 @@
+"""A team that lives while the world moves: stepped as one likes, and changed between two rounds.
+
+Parameters of constraints are arguments of the compiled rounds, so a changed one compiles nothing. Agents, constraints and links may come
+and go: then rounds are compiled once more, and everybody goes on with what they remember.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consat.certify.certificate import Verdict, bounds
+from consat.certify.optimum import max_min
+from consat.certify.reasons import explain
+from consat.engine.carry import Names, carried
+from consat.engine.chunks import CHUNK, Chunk, OneProcess
+from consat.engine.live import Live
+from consat.engine.recording import Choice, Memory, Rows, velocities
+from consat.engine.round import Body, Now, World, world_of
+from consat.engine.rounds import Tally, known_of
+from consat.errors import Fault, InvalidSettings, InvalidTeam, closest, shown
+from consat.numerics import float64
+from consat.problem.constraints.library import ADJUSTABLE, adjustable
+from consat.problem.constraints.record import Number, Vector
+from consat.problem.graphs import require_connected
+from consat.problem.objective import Objective
+from consat.problem.parameters import checked, still, vector
+from consat.problem.schedule import Schedule
+from consat.problem.team import Agent, Team
+from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
+from consat.protocols.estimates import Layout
+from consat.protocols.local.interior.layout import form_of
+from consat.results.result import Result
+from consat.results.trace import Trace
+from consat.runs.options import RATE, Options
+from consat.runs.preparation import Prepared, copies_of, scenario_of, settings_of
+from consat.runs.summary import summarise
+from consat.scenario import Scenario
+from consat.settings import Smoothing
+
+
+class Assessment(NamedTuple):
+    """What an observer of the whole team can say of it as it is now.
+
+    Attributes:
+        verdict: ``feasible``, ``infeasible`` or ``undecided``; proven.
+        bounds: (lower, upper) on the best margin that any formation has; None where nothing is proven.
+        reasons: what limits the team, who conflicts, and what would do, in words.
+        positions: (N, d) a formation of margin ``bounds[0]``.
+    """
+
+    verdict: Verdict
+    bounds: tuple[float | None, float | None]
+    reasons: list[str]
+    positions: np.ndarray
+
+
+class _Engine(NamedTuple):
+    """What is compiled for one structure of the team.
+
+    Attributes:
+        ready: the team when it was built.
+        carrier: who carries out the rounds.
+        live: the parameters, as arrays that are written to.
+        family: (M,) in which family each constraint is, in the team's order, …
+        member: … and at which place there.
+    """
+
+    ready: Prepared
+    carrier: OneProcess
+    live: Live
+    family: np.ndarray
+    member: np.ndarray
+
+
+class Session:
+    """A team that is stepped, and changed in between.
+
+    Args:
+        team: a `consat.Team` or a scenario, as in `consat.run`.
+        protocol: one in rounds; as in `consat.run`.
+        estimates: as in `consat.run`.
+        seed: of starts that are drawn, and of what gets lost.
+        start: ``(low, high)`` of the box they are drawn from, length.
+        smoothing: as in `consat.run`.
+        loss: probability that a message is lost.
+        sleep: probability that an agent skips a round.
+        rate: rounds a second, Hz; what schedules and `time` go by.
+        speed: the most that a body moves, length/s; None if bodies are where their agents want to be.
+
+    Raises:
+        InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
+        InvalidScenario: the scenario has faults.
+        InvalidSettings: the settings do not fit together.
+    """
+
+    @float64
+    def __init__(
+        self, team: Team | Scenario | str, *, protocol: str | None = None, estimates: Layout | None = None, seed: int | None = None,
+        start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
+        rate: float = RATE, speed: float | None = None,
+    ) -> None:  # fmt: skip
+        scenario = scenario_of(team)
+        self._options = Options(
+            protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, rate=rate,
+            speed=speed, stop="never",
+        )  # fmt: skip
+        self._name, self._source = scenario.name, scenario
+        settings = settings_of(scenario.settings, self._options, scenario.team)
+        kind = str(settings.protocol.kind)
+        if kind in FLOWS:
+            raise InvalidSettings(
+                f"protocol {kind} flows in continuous time, but a session goes in rounds; choose one of {', '.join(ROUNDS)}"
+            )
+        self._protocol = with_gains(ROUNDS[kind](), settings.protocol)
+        self._body = self._options.pace(kind, scenario.team).body or Body(rate)
+        self._weather = self._options.weather(settings.start.seed)
+        ready = Prepared.of(scenario.team, settings)
+        self._engine = self._built(ready, ready.first())
+        state, chunk = self._engine.carrier.start()
+        self._state: Now = state
+        self._tally, self._record = Tally(), Memory()
+        self._take(chunk)
+
+    # ---- stepping -----------------------------------------------------------------------------------------------------------------------
+
+    @float64
+    def step(self, rounds: int = 1) -> Self:
+        """Let so many rounds pass.
+
+        Args:
+            rounds: how many, at least 0.
+        """
+        if isinstance(rounds, bool) or not isinstance(rounds, int | np.integer) or rounds < 0:
+            raise InvalidSettings(f"rounds is {rounds!r}, but must be a whole number from 0")
+        left = int(rounds)
+        while left:
+            count = min(CHUNK, left)
+            self._state, chunk = self._engine.carrier.advance(self._state, self._tally.done, count, None, 1)
+            self._take(chunk)
+            left -= count
+        return self
+
+    def _take(self, chunk: Chunk) -> None:
+        chunk = jax.tree.map(np.asarray, chunk)
+        numbers = self._tally.add(chunk)
+        count = len(numbers)
+        kept = [leaf[:count] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound, chunk.kept.position, chunk.kept.agent_margin)]
+        margin, smooth, bound, position, margins = kept
+        self._margins, self._positions = margins[-1], position[-1]
+        chosen = numbers % self._record.every == 0
+        if chosen.any():
+            rows = Rows(numbers, position, None, margin, smooth, margins, None, None, bound)
+            self._record.append(rows.where(np.flatnonzero(chosen)))
+
+    @property
+    def round(self) -> int:
+        """Rounds so far."""
+        return self._tally.done
+
+    @property
+    def time(self) -> float:
+        """s since the start, at `rate` rounds a second."""
+        return self._tally.done / self._body.rate
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(N, d) where the agents are, in the order of ``session.team.ids``."""
+        return np.array(self._positions)
+
+    @property
+    def margins(self) -> np.ndarray:
+        """(N,) the margin of every agent, in the order of ``session.team.ids``."""
+        return np.array(self._margins)
+
+    @property
+    def margin(self) -> float:
+        """The least of them: positive where every constraint of everybody holds."""
+        return float(self._margins.min(initial=np.inf))
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether every constraint holds."""
+        return self.margin > 0
+
+    @property
+    def known(self) -> str | None:
+        """What every agent knows by itself: ``satisfied``, ``infeasible`` or nothing."""
+        return known_of(self._tally)
+
+    # ---- changing -----------------------------------------------------------------------------------------------------------------------
+
+    @float64
+    def change(self, agent: str, constraint: str, **parameters: Any) -> Self:
+        """Change parameters of a constraint; the next round uses them. Nothing compiles and nothing restarts, unless a parameter begins or
+        ceases to be a schedule.
+
+        Args:
+            agent: whose it is.
+            constraint: its name.
+            parameters: such as ``center=[3, 1]`` or ``radius=2``; ``weight`` too.
+
+        Raises:
+            InvalidTeam: no such agent, constraint or parameter, or a value that it cannot have; the session is as it was.
+        """
+        if not parameters:
+            return self
+        sides = self._sides(agent, constraint, parameters)
+        changes = [(number, self._checked(number, given)) for number, given in sides]
+        slots = [(self._engine.family[number], self._engine.member[number]) for number, _ in changes]
+        families = self._engine.ready.team.families
+        structural = any(
+            key == "weight" or isinstance(value, Schedule) or self._moves(families[f], key, m)
+            for (f, m), (_, given) in zip(slots, changes, strict=True)
+            for key, value in given.items()
+        )  # fmt: skip
+        if structural or any(families[f].psi not in ADJUSTABLE for f, _ in slots):
+            team = _with_parameters(self.team, changes)
+            if structural or self._bends_otherwise(team):
+                self._restructure(team)
+                return self
+        for (f, m), (_, given) in zip(slots, changes, strict=True):
+            for key, value in given.items():
+                self._engine.live.parameters[f][key][m] = value
+        self._note_changes({int(self._engine.ready.team.owner[number]) for number, _ in changes})
+        return self
+
+    @float64
+    def place(self, agent: str, position: ArrayLike) -> Self:
+        """Put an agent's body somewhere else: it was pushed, or measured there.
+
+        Args:
+            agent: who.
+            position: (d,), length.
+
+        Raises:
+            InvalidTeam: no such agent, or no position; the session is as it was.
+        """
+        i = self._place_of(agent)
+        faults: list[Fault] = []
+        value = vector(position, self.dimension, ("position",), "position", f"agent {agent!r}", faults)
+        if value is None:
+            raise InvalidTeam(faults)
+        self._state = _placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
+        self._positions = np.asarray(self._state.body)
+        self._margins = np.asarray(_margins(self._engine.carrier.world, self._state, float(self.round)))
+        return self
+
+    @float64
+    def add(self, agent: Agent, links: Iterable[str] | None = None) -> Self:
+        """Let an agent join.
+
+        Args:
+            agent: with its constraints, and where it is; at the middle of those it is linked to if it does not say.
+            links: ids of those it can talk to; by default those whose positions its constraints read.
+
+        Raises:
+            InvalidTeam: it does not fit the team; the session is as it was.
+        """
+        team = self.team
+        known = set(team.ids)
+        if not isinstance(agent, Agent):
+            raise InvalidTeam([Fault((), f"{shown(agent)} is no agent; give a consat.Agent", "add")])
+        given = None if links is None else [links] if isinstance(links, str) else list(links)
+        joined = [*team.agents, agent]
+        ends = [(agent.id, other) for other in given or ()]
+        new = Team(joined, [*team.linked, *ends], team.dimension)
+        if given is None:
+            i = new.count - 1
+            read = {int(j) for family in new.families for j in np.unique(family.agents[family.owner == i])} - {i}
+            ends = [(agent.id, new.ids[j]) for j in sorted(read)]
+            new = Team(joined, [*team.linked, *ends], team.dimension)
+        if agent.start is None and (near := [other for _, other in ends if other in known]):
+            middle = np.mean([self._positions[self._place_of(other)] for other in near], axis=0)
+            new.starts[-1] = middle
+        self._restructure(new)
+        return self
+
+    @float64
+    def remove(self, agent: str) -> Self:
+        """Let an agent go, with its constraints, its links, and the constraints that read its position.
+
+        Raises:
+            InvalidTeam: no such agent, the last one, or those that stay could not reach one another; the session is as it was.
+        """
+        i, team = self._place_of(agent), self.team
+        if team.count == 1:
+            raise InvalidTeam([Fault((), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
+        stays = np.delete(np.arange(team.count), i)
+        new, _ = team.part(stays)
+        self._require_connected(new, f"without agent {agent!r}")
+        self._restructure(new)
+        return self
+
+    @float64
+    def connect(self, one: str, other: str) -> Self:
+        """Let two agents talk to each other.
+
+        Raises:
+            InvalidTeam: no such agents, or they can already; the session is as it was.
+        """
+        pair, team = self._pair(one, other), self.team
+        if self._linked(team, pair):
+            raise InvalidTeam([Fault((), "they are linked already", f"link [{one}, {other}]")])
+        links = np.concatenate([team.links, np.array([pair], dtype=np.int32)])
+        self._restructure(team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))]))
+        return self
+
+    @float64
+    def disconnect(self, one: str, other: str) -> Self:
+        """Cut a link.
+
+        Raises:
+            InvalidTeam: there is none, or agents that depend on each other could not reach one another without; the session is as it was.
+        """
+        pair, team = self._pair(one, other), self.team
+        if not self._linked(team, pair):
+            raise InvalidTeam([Fault((), "there is no such link", f"link [{one}, {other}]")])
+        new = team.with_links(team.links[~(team.links == np.array(pair)).all(axis=1)])
+        self._require_connected(new, f"without the link [{one}, {other}]")
+        self._restructure(new)
+        return self
+
+    @float64
+    def add_constraint(self, agent: str, constraint: Any) -> Self:
+        """Give an agent one more constraint.
+
+        Args:
+            agent: whose it is.
+            constraint: what `consat.within` and its like return.
+
+        Raises:
+            InvalidTeam: it does not fit the team, or reads somebody out of reach; the session is as it was.
+        """
+        i, team = self._place_of(agent), self.team
+        agents = list(team.agents)
+        agents[i] = dataclasses.replace(agents[i], constraints=[*agents[i].constraints, constraint])
+        self._restructure(Team(agents, team.linked, team.dimension))
+        return self
+
+    @float64
+    def remove_constraint(self, agent: str, constraint: str) -> Self:
+        """Take a constraint from an agent.
+
+        Raises:
+            InvalidTeam: there is none of this name; the session is as it was.
+        """
+        numbers = self._named(agent, constraint)
+        team, i = self.team, self._place_of(agent)
+        gone = {team.names[number] for number in numbers}
+        agents = list(team.agents)
+        agents[i] = dataclasses.replace(agents[i], constraints=[each for each in agents[i].constraints if each.name not in gone])
+        self._restructure(Team(agents, team.linked, team.dimension))
+        return self
+
+    # ---- looking ------------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def dimension(self) -> int:
+        """d."""
+        return self._engine.ready.team.dimension
+
+    @property
+    def team(self) -> Team:
+        """The team as it is now: its constraints with the parameters that are in force. What moves with time keeps its schedule."""
+        team = self._engine.ready.team
+        families = [
+            dataclasses.replace(family, parameters={key: np.array(value) for key, value in own.items()})
+            for family, own in zip(team.families, self._engine.live.parameters, strict=True)
+        ]
+        return team.with_constraints(families, team.owner, team.names)
+
+    @float64
+    def assess(self) -> Assessment:
+        """What an observer can prove of the team as it is now, centrally."""
+        team = self.team.at(self.time)
+        best = max_min(team)
+        found = bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
+        lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
+        return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
+
+    @float64
+    def result(self) -> Result:
+        """What has been recorded so far, as of any other run; agents that have left are not in it."""
+        ready, tally = self._engine.ready, self._tally
+        rows = self._record.close()
+        if not len(rows.step) or rows.step[-1] != tally.done:
+            margin, smooth, bound = (np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound))
+            last = Rows(np.array([tally.done]), self._positions[None], None, margin, smooth, self._margins[None], None, None, bound)
+            rows = rows.joined(last) if len(rows.step) else last
+        period, team = 1.0 / self._body.rate, self.team
+        trace = Trace(
+            clock="round", steps=rows.step, position=rows.position, velocity=velocities(rows.step, rows.position, period),
+            margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin, estimate=None, integral=None,
+            holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
+            satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
+            floats_sent=tally.floats, known=known_of(tally), known_from=None, seconds={"compile": 0.0, "run": 0.0}, period=period,
+            bound=rows.bound, motion=tally.motion(period),
+        )  # fmt: skip
+        scenario = dataclasses.replace(scenario_of(team), name=self._name)
+        return Result(summarise(scenario, ready.settings, ready.schedule, ready.size, trace, full=False), trace=trace, team=team,
+                      scenario=scenario.text)  # fmt: skip
+
+    def __repr__(self) -> str:
+        team = self._engine.ready.team
+        return f"<Session of {self._name}: {team.count} agents, round {self.round}, margin {self.margin:.4g}>"
+
+    # ---- inside -------------------------------------------------------------------------------------------------------------------------
+
+    def _built(self, ready: Prepared, first: np.ndarray) -> _Engine:
+        team, kind = ready.team, str(ready.settings.protocol.kind)
+        require_connected(team)
+        live = Live.of(team, 1.0 / self._body.rate, all_of_them=True)
+        assert live is not None
+        world = world_of(
+            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=self._weather, body=self._body,
+            speaks=self._protocol.speaks, live=live,
+        )  # fmt: skip
+        choice = Choice.of(team, ready.copies, "all", estimates=False)
+        carrier = OneProcess(self._protocol, world, first, self._weather.seed, choice, None)
+        family, member = np.zeros((2, len(team.owner)), dtype=np.int64)
+        for f, each in enumerate(team.families):
+            family[each.number], member[each.number] = f, np.arange(each.size)
+        assert kind in ROUNDS
+        return _Engine(ready, carrier, live, family, member)
+
+    def _restructure(self, team: Team) -> None:
+        """Go on with another structure; what everybody remembers of what stays is carried over. Nothing happens where that cannot be."""
+        old = self._engine
+        copies = copies_of(team, old.ready.settings.protocol)
+        ready = old.ready._replace(team=team, copies=copies)
+        kind = str(ready.settings.protocol.kind)
+        names = [Names.of(each.team, each.copies, pairs=kind in PAIRED) for each in (old.ready, ready)]
+        first, body = self._first(ready)
+        engine = self._built(ready, first)
+        state, _ = engine.carrier.start()
+        inner = carried(self._protocol.per, self._state.state, state.state, *names)
+        state = state._replace(state=_begun_anew(inner), body=jnp.asarray(body), key=self._state.key)
+        margins = np.asarray(_margins(engine.carrier.world, state, float(self.round)))
+        # from here on nothing can fail
+        self._record = _renamed(self._record, names[0].agent, names[1].agent)
+        self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
+        self._engine, self._state, self._positions, self._margins = engine, state, body, margins
+
+    def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
+        """(C, d) estimates to begin with: of new copies where their owner is, and (N, d) bodies."""
+        team, copies = ready.team, ready.copies
+        place = {agent: k for k, agent in enumerate(self._engine.ready.team.ids)}
+        drawn = ready.first()
+        body = drawn[copies.own]
+        for i, agent in enumerate(team.ids):
+            if agent in place:
+                body[i] = self._positions[place[agent]]
+            elif np.isfinite(team.starts[i]).all():
+                body[i] = team.starts[i]
+        return body[copies.position], body
+
+    def _place_of(self, agent: str) -> int:
+        ids = self._engine.ready.team.ids
+        found = next((k for k, each in enumerate(ids) if each == agent), None)
+        if found is None:
+            raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(agent, ids)}", f"agent {shown(agent)}")])
+        return found
+
+    def _pair(self, one: str, other: str) -> tuple[int, int]:
+        i, j = self._place_of(one), self._place_of(other)
+        if i == j:
+            raise InvalidTeam([Fault((), "an agent is not linked to itself; name another", f"agent {one!r}")])
+        return min(i, j), max(i, j)
+
+    @staticmethod
+    def _linked(team: Team, pair: tuple[int, int]) -> bool:
+        return bool((team.links == np.array(pair)).all(axis=1).any())
+
+    @staticmethod
+    def _require_connected(team: Team, without: str) -> None:
+        try:
+            require_connected(team)
+        except InvalidTeam as error:
+            raise InvalidTeam([dataclasses.replace(fault, where=without) for fault in error.faults]) from None
+
+    def _named(self, agent: str, constraint: str) -> list[int]:
+        """The places of an agent's constraint of this name; of all sides of a box."""
+        team, i = self._engine.ready.team, self._place_of(agent)
+        low, high = np.searchsorted(team.owner, [i, i + 1])
+        names = {team.names[k]: k for k in range(int(low), int(high))}
+        if constraint in names:
+            return [names[constraint]]
+        sides = [k for name, k in names.items() if name.startswith((f"{constraint}.low[", f"{constraint}.high["))]
+        if not sides:
+            own = ", ".join(map(repr, list(names)[:8])) or "none"
+            message = f"there is no constraint {shown(constraint)}{closest(constraint, names)}; it has {own}"
+            raise InvalidTeam([Fault((), message, f"agent {agent!r}")])
+        return sides
+
+    def _sides(self, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[tuple[int, Mapping[str, Any]]]:
+        """Which constraints are changed, and which of their parameters; of a box ``low`` and ``high`` are those of its sides."""
+        numbers = self._named(agent, constraint)
+        if len(numbers) == 1:
+            return [(numbers[0], parameters)]
+        team, where = self._engine.ready.team, f"agent {agent!r}, constraint {constraint!r}"
+        if unknown := [key for key in parameters if key not in ("low", "high", "weight")]:
+            raise InvalidTeam([Fault((), f"there is no parameter {unknown[0]!r}; it has low, high and weight", where)])
+        own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
+        limits = {side: parameters.get(side, self._parameter(k, side)) for side, k in own.items()}
+        faults: list[Fault] = []
+        checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
+        if faults:
+            raise InvalidTeam(faults)
+        return [
+            (k, given)
+            for k in numbers
+            if (given := {key: value for key, value in parameters.items() if key == "weight" or f".{key}[" in team.names[k]})
+        ]
+
+    def _parameter(self, number: int, key: str) -> np.ndarray:
+        f, m = self._engine.family[number], self._engine.member[number]
+        return np.asarray(self._engine.live.parameters[f][key])[m]
+
+    def _checked(self, number: int, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The values of changed parameters, as arrays or schedules. Raises: InvalidTeam."""
+        team = self._engine.ready.team
+        family = team.families[self._engine.family[number]]
+        where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
+        faults: list[Fault] = []
+        values: dict[str, Any] = {}
+        allowed = adjustable(family.psi, family.parameters)
+        for key, value in given.items():
+            if key not in allowed and key != "weight":
+                names = ", ".join([*allowed, "weight"])
+                faults.append(Fault((key,), f"there is no parameter {key!r} to change{closest(key, allowed)}; it has {names}", where))
+                continue
+            parameter = dataclasses.replace(allowed.get(key, _WEIGHT), value=value)
+            found = (still if key == "weight" else checked)(parameter, team.dimension, (key,), key, where, faults)
+            if found is None:
+                continue
+            shape = family.parameters[key].shape[1:] if key != "weight" else ()
+            if (found.values.shape[1:] if isinstance(found, Schedule) else found.shape) != shape:
+                faults.append(Fault((key,), f"{key} is {shown(value)}, but must have shape {shape}", where))
+            values[key] = found
+        if faults:
+            raise InvalidTeam(faults)
+        return values
+
+    @staticmethod
+    def _moves(family: Any, key: str, member: int) -> bool:
+        track = family.tracks.get(key)
+        return track is not None and track.schedule(int(member)) is not None
+
+    def _bends_otherwise(self, team: Team) -> bool:
+        """Whether what was compiled of the curvature of constraints does not hold of a team with other parameters."""
+        before = self._engine.ready.team
+        return any(
+            form_of(old, team.dimension) != form_of(new, team.dimension)
+            for old, new in zip(before.families, team.families, strict=True)
+            if old.psi not in ADJUSTABLE
+        )
+
+    def _note_changes(self, owners: Iterable[int]) -> None:
+        """Those whose constraints have changed tell everybody that proofs begin anew."""
+        inner = self._state.state
+        if "inbox" in getattr(inner, "_fields", ()) and hasattr(inner, "memory"):
+            where = np.zeros(len(self._positions))
+            where[list(owners)] = 1.0
+            self._state = self._state._replace(state=_raised(inner, where))
+
+
+_WEIGHT = Number(None, positive=True)
+
+
+def _with_parameters(team: Team, changes: Sequence[tuple[int, Mapping[str, Any]]]) -> Team:
+    """The team with other parameters, weights and schedules of some constraints, by their numbers."""
+    agents = list(team.agents)
+    start = np.searchsorted(team.owner, team.owner)
+    for number, given in changes:
+        i = int(team.owner[number])
+        own = list(agents[i].constraints)
+        k = number - int(start[number])
+        old = own[k]
+        parameters = {key: dataclasses.replace(each, value=given[key]) if key in given else each for key, each in old.parameters.items()}
+        own[k] = dataclasses.replace(old, parameters=parameters, weight=float(given.get("weight", old.weight)))
+        agents[i] = dataclasses.replace(agents[i], constraints=own)
+    return Team(agents, team.linked, team.dimension)
+
+
+@jax.jit
+def _raised(state: Any, where: Any) -> Any:
+    memory = state.memory
+    here = jnp.asarray(where) > 0
+    return state._replace(memory=memory._replace(changes=memory.changes + where, bound=jnp.where(here, jnp.inf, memory.bound)))
+
+
+def _begun_anew(state: Any) -> Any:
+    """The state of a team of another structure: what was proven is so no more."""
+    if not hasattr(state, "memory") or not hasattr(state.memory, "changes"):
+        return state
+    memory = state.memory
+    changes = jnp.zeros_like(memory.changes) + jnp.max(memory.changes, initial=0.0) + 1.0
+    return state._replace(memory=memory._replace(changes=changes, bound=jnp.full_like(memory.bound, jnp.inf)))
+
+
+@jax.jit
+def _body_moved(body: Any, x: Any, row: Any, i: Any, value: Any) -> tuple[Any, Any]:
+    return body.at[i].set(value), x.at[row].set(value)
+
+
+def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> Now:
+    """With a body somewhere else; own: whether the agent's estimate of its own position goes with it."""
+    row = world.own[i]
+    body, x = _body_moved(now.body, now.state.x, row, jnp.asarray(i), jnp.asarray(value))
+    state = now.state
+    if own:
+        state = state._replace(memory=state.memory._replace(y=x)) if "x" not in state._fields else state._replace(x=x)
+    heard = now.heard
+    if heard is not None:
+        heard = heard._replace(position=heard.position.at[row].set(jnp.asarray(value)))
+    return now._replace(state=state, body=body, heard=heard)
+
+
+@jax.jit
+def _margins(world: World, now: Now, round_: Any) -> Any:
+    observer: Objective = world.at(jnp.asarray(round_)).observer
+    return observer.agent_margins(now.body)
+
+
+def _renamed(record: Memory, before: Sequence[str], after: Sequence[str]) -> Memory:
+    """A record with the rows of other agents; those who were not there yet are nowhere."""
+    rows, place = record.close(), {agent: k for k, agent in enumerate(before)}
+    where = np.array([place.get(agent, -1) for agent in after])
+    there = where >= 0
+
+    def arranged(values: np.ndarray) -> np.ndarray:
+        found = np.full((len(values), len(after), *values.shape[2:]), np.nan)
+        found[:, there] = values[:, where[there]]
+        return found
+
+    fresh = Memory(record.every)
+    fresh.append(rows._replace(position=arranged(rows.position), agent_margin=arranged(rows.agent_margin)))
+    return fresh
