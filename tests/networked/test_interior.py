@@ -145,7 +145,9 @@ def test_a_proof_of_another_team_is_not_used() -> None:
     found = {}
     for mine, theirs in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)):
         inbox.pair[0, 0] = theirs
-        changed = state._replace(core=state.core._replace(changes=np.array(mine), bounds=np.full(2, np.inf)))
+        inner, proven = state.core.inner, np.full(2, np.inf)
+        inner = inner._replace(memory=inner.memory._replace(changes=np.array([mine]), bound=np.full(1, np.inf)))
+        changed = state._replace(core=state.core._replace(inner=inner, bounds=proven))
         found[mine, theirs] = station.core.turn(changed, inbox, arrived, moment(station.core))[2].bound
     assert found[1.0, 0.0] == math.inf
     assert found[0.0, 0.0] == found[1.0, 1.0] == found[0.0, 1.0] == pytest.approx(BEST["case-d"], rel=0.05)
@@ -357,10 +359,10 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
         return values + values.swapaxes(1, 2) if values.ndim == 3 else values
 
     mail = jax.tree.map(drawn, interior.silence())
-    numbers = np.asarray(packing.pack(np.array(3.0), mail))
+    numbers = np.asarray(packing.pack(mail._replace(changes=np.full(2, 3.0))))
     assert [np.flatnonzero(row)[-1] + 1 for row in numbers] == [letter.length for letter in letters]
-    changes, back = packing.unpack(numbers, width)
-    assert np.asarray(changes).tolist() == [3.0, 3.0]
+    back = packing.unpack(numbers, width)
+    assert np.asarray(back.changes).tolist() == [3.0, 3.0]
     for row, letter in enumerate(letters):
         p, q = letter.size, letter.size - 1
         for got, sent in ((back.matrix, mail.matrix), (back.vector, mail.vector)):
