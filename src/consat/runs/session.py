@@ -35,6 +35,7 @@ from consat.problem.schedule import Schedule
 from consat.problem.team import Agent, Team
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
+from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior.layout import form_of
 from consat.results.result import Result
 from consat.results.trace import Trace
@@ -565,10 +566,13 @@ class Session:
     def _note_changes(self, owners: Iterable[int]) -> None:
         """Those whose constraints have changed tell everybody that proofs begin anew."""
         inner = self._state.state
-        if "inbox" in getattr(inner, "_fields", ()) and hasattr(inner, "memory"):
-            where = np.zeros(len(self._positions))
-            where[list(owners)] = 1.0
-            self._state = self._state._replace(state=_raised(inner, where))
+        if not isinstance(inner, InteriorState):
+            return
+        where = np.zeros(len(self._positions))
+        where[list(owners)] = 1.0
+        changes, bound = _raised(inner.memory.changes, inner.memory.bound, where)
+        memory = inner.memory._replace(changes=changes, bound=bound)
+        self._state = self._state._replace(state=inner._replace(memory=memory))
 
 
 _WEIGHT = Number(None, positive=True)
@@ -590,15 +594,14 @@ def _with_parameters(team: Team, changes: Sequence[tuple[int, Mapping[str, Any]]
 
 
 @jax.jit
-def _raised(state: Any, where: Any) -> Any:
-    memory = state.memory
-    here = jnp.asarray(where) > 0
-    return state._replace(memory=memory._replace(changes=memory.changes + where, bound=jnp.where(here, jnp.inf, memory.bound)))
+def _raised(changes: Any, bound: Any, where: Any) -> tuple[Any, Any]:
+    """Counts of changes and bounds, with those of some agents raised and gone."""
+    return changes + where, jnp.where(where > 0, jnp.inf, bound)
 
 
 def _begun_anew(state: Any) -> Any:
     """The state of a team of another structure: what was proven is so no more."""
-    if not hasattr(state, "memory") or not hasattr(state.memory, "changes"):
+    if not isinstance(state, InteriorState):
         return state
     memory = state.memory
     changes = jnp.zeros_like(memory.changes) + jnp.max(memory.changes, initial=0.0) + 1.0
@@ -616,7 +619,7 @@ def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> 
     body, x = _body_moved(now.body, now.state.x, row, jnp.asarray(i), jnp.asarray(value))
     state = now.state
     if own:
-        state = state._replace(memory=state.memory._replace(y=x)) if "x" not in state._fields else state._replace(x=x)
+        state = state._replace(memory=state.memory._replace(y=x)) if isinstance(state, InteriorState) else state._replace(x=x)
     heard = now.heard
     if heard is not None:
         heard = heard._replace(position=heard.position.at[row].set(jnp.asarray(value)))

@@ -1,0 +1,269 @@
+"""A team that is stepped, and changed between two rounds."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import consat as cs
+
+
+def trio(**more: Any) -> cs.Team:
+    return cs.Team(
+        [
+            cs.Agent("a1", [cs.within([2, 0], 1, name="goal")], start=[3, 1]),
+            cs.Agent("a2", [cs.near("a1", 3), cs.near("a3", 2)], start=[0, 2]),
+            cs.Agent("a3", [cs.within([-2, 0], 1, name="goal")], start=[-3, -1]),
+        ],
+        links=[("a1", "a2"), ("a2", "a3")],
+        **more,
+    )
+
+
+@pytest.fixture(scope="module")
+def settled() -> cs.Session:
+    return cs.Session(trio()).step(30)
+
+
+def state_of(session: cs.Session) -> tuple[str, list[Any], int, float]:
+    return cs.dump(session.team), session.positions.tolist(), session.round, session.margin
+
+
+def test_rounds_are_those_of_a_run(settled: cs.Session) -> None:
+    run = cs.run(trio(), rounds=30)
+    np.testing.assert_array_equal(settled.positions, run.data["position"].values[-1])
+    np.testing.assert_allclose(settled.margins, [run.summary["agents"][agent]["margin"] for agent in ("a1", "a2", "a3")], atol=1e-12)
+    assert settled.satisfied
+    assert settled.known == "satisfied"
+    assert (settled.round, settled.time) == (30, 1.5)
+
+
+def test_parameters_compile_nothing_and_the_team_follows() -> None:
+    session = cs.Session(trio()).step(20)
+    session.change("a1", "goal", center=[2.01, 0]).step(10)
+    with_listener: list[str] = []
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        if event.startswith("/jax/core/compile/backend_compile"):
+            with_listener.append(event)
+
+    import jax
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for k in range(5):
+            session.change("a1", "goal", center=[2.2, 0.1 * k]).step(10)
+            assert session.satisfied
+        session.change("a1", "goal", radius=0.5).change("a2", "near(a1)", radius=2.5).step(20)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert with_listener == []
+    fresh = cs.Session(session.team).step(60)
+    assert session.margin == pytest.approx(fresh.margin, abs=0.02)
+    np.testing.assert_allclose(session.margins, cs.margins(session.team, session.positions), atol=1e-12)
+
+
+def test_an_impossible_goal_is_proven_so_by_the_team_and_forgotten_when_it_is_possible_again() -> None:
+    session = cs.Session(trio()).step(20)
+    session.change("a1", "goal", center=[9, 0]).step(60)
+    assert session.known == "infeasible"
+    told = session.assess()
+    assert told.verdict == "infeasible"
+    assert told.bounds[1] is not None
+    assert told.bounds[1] < 0
+    assert any("goal" in reason for reason in told.reasons)
+    assert session.margin <= told.bounds[1] + 1e-9
+    session.change("a1", "goal", center=[2, 0])
+    for _ in range(80):  # never a proof of what is no more
+        session.step()
+        assert session.known != "infeasible"
+    assert session.satisfied
+    assert session.assess().verdict == "feasible"
+
+
+def test_members_and_links_come_and_go_and_the_others_go_on() -> None:
+    session = cs.Session(trio()).step(20)
+    before = session.positions
+    session.add(cs.Agent("a4", [cs.near("a3", 1), cs.within([-2, 1], 1, name="post")]), links=["a3"])
+    np.testing.assert_array_equal(session.positions[:3], before)
+    margin = session.margins[:3].min()
+    session.step(3)
+    assert session.margins[:3].min() > 0.5 * margin  # they did not begin again
+    session.step(20)
+    assert session.satisfied
+    assert list(session.team.ids) == ["a1", "a2", "a3", "a4"]
+    session.connect("a4", "a2").step(5).disconnect("a4", "a3").step(20)
+    assert session.satisfied
+    session.add_constraint("a4", cs.within([-1.5, 0.5], 1, name="second")).step(20)
+    assert session.satisfied
+    assert len(session.team.agents[3].constraints) == 3
+    session.remove_constraint("a4", "second").remove("a4").step(10)
+    assert cs.dump(session.team) == cs.dump(cs.Session(trio()).team)
+    assert session.satisfied
+    result = session.result()
+    assert result.summary["status"] == "satisfied"
+    assert result.data["position"].shape == (session.round + 1, 3, 2)
+    assert result.data["margin"].shape == (session.round + 1,)
+
+
+def test_without_the_middle_nobody_can_talk() -> None:
+    team = cs.Team(
+        [cs.Agent(f"b{k}", [cs.near(f"b{k - 1}", 2)] if k else [cs.within([0, 0], 1)], start=[k, 0]) for k in range(4)], links="line"
+    )
+    session = cs.Session(team).step(5)
+    session.remove("b1").step(20)  # and with it b2's constraint, which read it
+    assert session.satisfied
+    assert list(session.team.ids) == ["b0", "b2", "b3"]
+    held = state_of(session)
+    with pytest.raises(cs.InvalidTeam, match=r"without the link \[b2, b3\].*add a link such as"):
+        session.disconnect("b2", "b3")
+    assert state_of(session) == held
+
+
+def wrong_changes() -> list[Callable[[cs.Session], Any]]:
+    return [
+        lambda s: s.change("a9", "goal", center=[0, 0]),
+        lambda s: s.change("a1", "gaol", center=[0, 0]),
+        lambda s: s.change("a1", "goal", center=[0, 0, 0]),
+        lambda s: s.change("a1", "goal", center=[0, float("nan")]),
+        lambda s: s.change("a1", "goal", center="here"),
+        lambda s: s.change("a1", "goal", radius=-1),
+        lambda s: s.change("a1", "goal", radius=True),
+        lambda s: s.change("a1", "goal", center=[1, 1], radius=0),
+        lambda s: s.change("a1", "goal", vector=[1, 1]),
+        lambda s: s.change("a1", "goal", weight=-2),
+        lambda s: s.change("a1", "goal", center={"times": [1, 0], "values": [[0, 0], [1, 1]]}),
+        lambda s: s.place("a1", [1]),
+        lambda s: s.place("nobody", [1, 1]),
+        lambda s: s.add("a4"),
+        lambda s: s.add(cs.Agent("a1", [cs.within([0, 0], 1)])),
+        lambda s: s.add(cs.Agent("a4", [cs.near("a7", 1)])),
+        lambda s: s.add(cs.Agent("a4", [cs.near("a1", 1)]), links=["a8"]),
+        lambda s: s.add(cs.Agent("a4", [cs.near("a1", 1)]), links=[]),
+        lambda s: s.remove("a8"),
+        lambda s: s.connect("a1", "a2"),
+        lambda s: s.connect("a1", "a1"),
+        lambda s: s.disconnect("a1", "a3"),
+        lambda s: s.disconnect("a1", "a2"),
+        lambda s: s.add_constraint("a1", "within"),
+        lambda s: s.add_constraint("a1", cs.within([0, 0], 1, name="goal")),
+        lambda s: s.remove_constraint("a1", "near(a2)"),
+    ]
+
+
+@pytest.mark.parametrize("change", wrong_changes())
+def test_a_refused_change_leaves_the_session_as_it_was(settled: cs.Session, change: Callable[[cs.Session], Any]) -> None:
+    before = state_of(settled)
+    with pytest.raises(cs.ConsatError) as refused:
+        change(settled)
+    assert str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert state_of(settled) == before
+
+
+def test_hundreds_of_good_and_bad_changes_leave_what_a_fresh_session_has() -> None:
+    random, wrong = np.random.default_rng(4), wrong_changes()
+    session = cs.Session(trio()).step(20)
+    goals: dict[str, tuple[list[float], float]] = {"a1": ([2.0, 0.0], 1.0), "a3": ([-2.0, 0.0], 1.0)}
+    joined, refused = False, 0
+    for turn in range(300):
+        kind = random.integers(0, 10)
+        if kind < 4:
+            agent = str(random.choice(["a1", "a3"]))
+            center, radius = (np.array(goals[agent][0]) + random.uniform(-0.05, 0.05, 2)).tolist(), float(random.uniform(0.8, 1.2))
+            goals[agent] = (center, radius)
+            session.change(agent, "goal", center=center, radius=radius)
+        elif kind < 8:
+            before = state_of(session)
+            with pytest.raises(cs.ConsatError):
+                wrong[int(random.integers(len(wrong)))](session)
+            assert state_of(session) == before
+            refused += 1
+        elif turn % 30 == 29:
+            session = session.remove("a4") if joined else session.add(cs.Agent("a4", [cs.near("a3", 2)]), links=["a2", "a3"])
+            joined = not joined
+        session.step(int(random.integers(0, 3)))
+    assert refused > 80
+    if joined:
+        session.remove("a4")
+    session.step(60)
+    expected = cs.Team(
+        [
+            cs.Agent("a1", [cs.within(*goals["a1"], name="goal")], start=[3, 1]),
+            cs.Agent("a2", [cs.near("a1", 3), cs.near("a3", 2)], start=[0, 2]),
+            cs.Agent("a3", [cs.within(*goals["a3"], name="goal")], start=[-3, -1]),
+        ],
+        links=[("a1", "a2"), ("a2", "a3")],
+    )
+    assert cs.dump(session.team) == cs.dump(expected)
+    fresh = cs.Session(expected).step(80)
+    assert session.satisfied == fresh.satisfied
+    assert session.margin == pytest.approx(fresh.margin, abs=0.02)
+
+
+def test_schedules_and_the_time_are_followed_and_can_begin_in_a_session() -> None:
+    session = cs.Session(trio(), rate=10).step(20)
+    path = cs.schedule([2.0, 4.0], [[2.0, 0.0], [2.0, 0.8]])
+    session.change("a1", "goal", center=path)
+    assert session.team.moves
+    for _ in range(30):
+        session.step()
+        assert session.satisfied
+        here = session.team.at(session.time)
+        np.testing.assert_allclose(session.margins, cs.margins(here, session.positions), atol=1e-12)
+    assert session.team.at(session.time).families[0].parameters["center"][0].tolist() == [2.0, 0.8]
+    session.change("a1", "goal", center=[2.0, 0.0]).step(10)
+    assert not session.team.moves
+    assert session.satisfied
+
+
+def test_own_constraints_change_too() -> None:
+    def disc(x: Any, *, at: Any, scale: Any) -> Any:
+        return 1.0 - scale * jnp.sum((x - at) ** 2)
+
+    own = cs.constraint(disc, reads=("a",), name="own", at=[1.0, 0.0], scale=1.0)
+    session = cs.Session(cs.Team([cs.Agent("a", [own], start=[5, 5])])).step(30)
+    assert session.satisfied
+    session.change("a", "own", at=[3.0, 0.0]).step(20)
+    assert session.satisfied
+    session.change("a", "own", scale=-1.0).step(1)  # it bends the other way: not concave any more
+    np.testing.assert_allclose(session.margins, [1.0 + np.sum((session.positions[0] - [3.0, 0.0]) ** 2)])
+    with pytest.raises(cs.InvalidTeam, match="there is no parameter 'sale'.*did you mean 'scale'"):
+        session.change("a", "own", sale=2.0)
+
+
+def test_a_body_that_is_pushed_comes_back() -> None:
+    session = cs.Session(trio(), rate=10, speed=2.0).step(60)
+    assert session.satisfied
+    session.place("a1", [5, 5])
+    assert session.positions[0].tolist() == [5, 5]
+    assert not session.satisfied
+    session.step(1)
+    assert np.linalg.norm(session.positions[0] - [5, 5]) == pytest.approx(0.2)
+    session.step(60)
+    assert session.satisfied
+    jumps = cs.Session(trio()).step(20).place("a1", [5, 5]).step(20)
+    assert jumps.satisfied
+
+
+def test_a_box_is_changed_as_a_whole() -> None:
+    session = cs.Session(cs.Team([cs.Agent("a", [cs.box([0, 0], [1, 1]), cs.within([0, 0], 9)], start=[5, 5])])).step(20)
+    session.change("a", "box", low=[2, 2], high=[3, 3]).step(30)
+    assert np.all((session.positions[0] > 2) & (session.positions[0] < 3))
+    with pytest.raises(cs.InvalidTeam, match="high is .* but must be above low"):
+        session.change("a", "box", low=[4, 4])
+    with pytest.raises(cs.InvalidSettings, match="rounds is -1"):
+        session.step(-1)
+
+
+def test_a_session_of_admm_carries_over_too() -> None:
+    session = cs.Session(trio(), protocol="admm").step(30)
+    assert session.satisfied
+    session.add(cs.Agent("a4", [cs.near("a3", 1)])).step(3)
+    assert session.margins[:3].min() > 0
+    session.change("a1", "goal", center=[2.2, 0.2]).step(30)
+    assert session.satisfied
+    with pytest.raises(cs.InvalidSettings, match="a session goes in rounds"):
+        cs.Session(trio(), protocol="gradient-flow")
