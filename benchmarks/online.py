@@ -1,0 +1,295 @@
+"""Teams whose goals move, and teams that change: how well consat keeps up, beside what others do.
+
+    python benchmarks/online.py [--quick] [--out docs/benchmarks]
+
+Writes ``online.md`` and ``online.png``. Teams are random trees of discs whose centres wander by a part of their radius a round; the exact
+best margin is at least 0.2 of the least radius squared at all times, as one cone program for the whole team at many times shows. A round is
+one message over each link in each direction. Lag: how far agents are from where the same team, frozen at that instant, would settle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from rounds import machine, table
+
+import consat as cs
+from consat.certify.optimum import max_min
+from consat.numerics import float64
+from consat.problem.objective import Nu, Objective
+from consat.problem.units import automatic, scale
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+RATE = 20.0
+DURATION = 30.0
+KNOT = 2.0
+"""s between two bends of a path."""
+LEAST = 0.2
+DRIFTS = (0.0025, 0.005, 0.01, 0.02, 0.04)
+"""Of the radius, a round."""
+
+
+@float64
+def moving_team(seed: int, drift: float, count: int | None = None) -> cs.Team:
+    """A random tree; every third agent has a goal that wanders by `drift` of its radius a round, all of them along one another.
+
+    Each team is drawn again until its best margin stays above `LEAST` at every bend of the paths and between.
+    """
+    for attempt in range(200):
+        random = np.random.default_rng([seed, attempt])
+        n = int(random.integers(4, 13)) if count is None else count
+        place = np.zeros((n, 2))
+        parent = [0] * n
+        for k in range(1, n):
+            parent[k] = int(random.integers(max(0, k - 4), k))
+            place[k] = place[parent[k]] + random.normal(size=2)
+        times = np.arange(0.0, DURATION + KNOT, KNOT)
+        common = np.cumsum(_steps(random, len(times), drift), axis=0)
+        agents = []
+        for k in range(n):
+            own: list[Any] = []
+            radius = float(random.uniform(0.8, 1.5))
+            if k % 3 == 0:
+                path = place[k] + radius * (common + 0.1 * np.cumsum(_steps(random, len(times), drift), axis=0))
+                own.append(cs.within(cs.schedule(times, path), radius, name="goal"))
+            if k:
+                reach = float(np.linalg.norm(place[k] - place[parent[k]]) + random.uniform(0.6, 1.2))
+                own.append(cs.near(f"r{parent[k]}", reach))
+            agents.append(cs.Agent(f"r{k}", own, start=place[k] + random.normal(size=2)))
+        team = cs.Team(agents, links=[(f"r{parent[k]}", f"r{k}") for k in range(1, n)])
+        if all(max_min(team.at(t)).margin >= LEAST for t in times[::3].tolist()):
+            return team
+    raise RuntimeError(f"no team of seed {seed} keeps a margin of {LEAST} at a drift of {drift}")
+
+
+def _steps(random: np.random.Generator, count: int, drift: float) -> np.ndarray:
+    """(count, 2) moves from knot to knot, each of length drift·rounds, in radii; the first is none."""
+    angle = np.cumsum(random.uniform(-1.2, 1.2, count))
+    step = drift * RATE * KNOT * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    step[0] = 0.0
+    return step
+
+
+def followed(team: cs.Team, loss: float, seed: int) -> dict[str, float]:
+    """What consat's default does of it."""
+    summary = cs.run(team, rate=RATE, until=DURATION, loss=loss, seed=seed, record=False).summary
+    motion = summary["motion"]
+    return {"share": motion["satisfied_share_after"] or 0.0, "worst": motion["worst_margin_after"] or -np.inf}
+
+
+@float64
+def resolved(team: cs.Team, every: int) -> dict[str, float]:
+    """A solver for the whole team, asked again every so many rounds; agents stay where it last sent them."""
+    margins, x = [], None
+    for k in range(1, round(RATE * DURATION) + 1):
+        if (k - 1) % every == 0:
+            x = max_min(team.at((k - 1) / RATE)).positions
+        margins.append(float(cs.margins(team.at(k / RATE), x).min()))
+    return _told(np.array(margins))
+
+
+@float64
+def descended(team: cs.Team) -> dict[str, float]:
+    """Gradient ascent on the smooth margin (paper, eq. 9), one step a round, at the best of many step lengths."""
+    size = scale(team)
+    smoothing = automatic(size)
+    nu = Nu(float(smoothing.nu_alpha), float(smoothing.nu_beta))  # type: ignore[arg-type]
+    first = np.where(np.isnan(team.starts), size.center, team.starts)
+    teams = [team.at(k / RATE) for k in range(1, round(RATE * DURATION) + 1)]
+    stacked = [
+        {key: jnp.asarray(np.stack([each.families[f].parameters[key] for each in teams])) for key in team.families[f].parameters}
+        for f in range(len(team.families))
+    ]
+    observer = Objective.at_positions(team)
+
+    @functools.partial(jax.jit)
+    def track(step: Any) -> Any:
+        def one(x: Any, values: Any) -> Any:
+            here = observer.with_parameters(values)
+            slope = jax.grad(lambda at: here.smooth_margin(at, nu))(x)
+            x = x + step * size.length**2 / size.psi * slope
+            return x, jnp.min(here.agent_margins(x))
+
+        return jax.lax.scan(one, jnp.asarray(first), stacked)[1]
+
+    found = [_told(np.asarray(track(step))) for step in np.geomspace(1e-3, 1.0, 13)]
+    return max(found, key=lambda each: (each["share"], each["worst"]))
+
+
+def _told(margin: np.ndarray) -> dict[str, float]:
+    held = np.flatnonzero(margin > 0)
+    if not len(held):
+        return {"share": 0.0, "worst": -np.inf}
+    since = margin[held[0] :]
+    return {"share": float(np.mean(since > 0)), "worst": float(since.min())}
+
+
+METHODS: dict[str, Callable[[cs.Team, int], dict[str, float]]] = {
+    "consat": lambda team, seed: followed(team, 0.0, seed),
+    "consat, 30 % loss": lambda team, seed: followed(team, 0.3, seed),
+    "central, every 10 rounds": lambda team, _: resolved(team, 10),
+    "central, every 40 rounds": lambda team, _: resolved(team, 40),
+    "gradient, best step": lambda team, _: descended(team),
+}
+
+
+def recovery(seeds: Sequence[int]) -> list[list[Any]]:
+    """Rounds until every constraint holds again after a change, and from a fresh start of the changed team."""
+
+    def chain(seed: int, n: int = 8) -> cs.Team:
+        random = np.random.default_rng(seed)
+        agents = [
+            cs.Agent(
+                f"a{k}",
+                [cs.within([0.8 * k, 0.0], 0.9, name="goal")] * (k in (0, n - 1)) + [cs.near(f"a{k - 1}", 1.05)] * (k > 0),
+                start=[0.8 * k + 0.3 * random.normal(), random.normal()],
+            )
+            for k in range(n)
+        ]
+        return cs.Team(agents, links=[(f"a{k}", f"a{k + 1}") for k in range(n - 1)] + [("a0", "a2"), ("a5", "a7")])
+
+    def until(session: cs.Session, most: int = 400) -> float:
+        last = session.round if session.margin <= 0 else None
+        begin = session.round
+        for _ in range(most):
+            session.step()
+            if session.margin <= 0:
+                last = session.round
+            elif last is None or session.round - last >= 10 or (session.round - begin >= 10 and last is None):
+                break
+        return 0.0 if last is None else last + 1 - begin
+
+    changes: dict[str, Callable[[cs.Session], Any]] = {
+        "a goal moves by a tenth of its radius": lambda s: s.change("a7", "goal", center=[5.6 + 0.09, 0.0]),
+        "a goal moves by its radius": lambda s: s.change("a7", "goal", center=[5.6 + 0.9, 0.0]),
+        "an agent dies": lambda s: s.remove("a6"),
+        "an agent joins": lambda s: s.add(cs.Agent("b", [cs.near("a3", 1.0), cs.within([2.4, 1.2], 0.9)], start=[2.4, 4.0]), links=["a3"]),
+        "a link is cut": lambda s: s.disconnect("a5", "a7"),
+        "a link heals": lambda s: s.connect("a1", "a3"),
+    }
+    rows = []
+    for name, change in changes.items():
+        after, fresh = [], []
+        for seed in seeds:
+            session = cs.Session(chain(seed)).step(60)
+            change(session)
+            team = session.team
+            after.append(until(session))
+            fresh.append(until(cs.Session(team)))
+        rows.append([name, f"{np.median(after):.0f}", f"{np.max(after):.0f}", f"{np.median(fresh):.0f}", f"{np.max(fresh):.0f}"])
+    return rows
+
+
+def costs() -> list[list[Any]]:
+    """What a changed parameter costs: a change and a round, over a round."""
+    rows = []
+    for n in (3, 100, 1000):
+        agents = [
+            cs.Agent(f"a{k}", [cs.within([0.5 * k, 0], 2, name="goal")] + [cs.near(f"a{k - 1}", 2)] * (k > 0), start=[0.5 * k, 1])
+            for k in range(n)
+        ]
+        session = cs.Session(cs.Team(agents, links="line")).step(20)
+
+        def timed(act: Callable[[int], Any], session: cs.Session = session, turns: int = 60) -> float:
+            spent = []
+            for k in range(turns):
+                began = time.perf_counter()
+                act(k)
+                session.step(1)
+                spent.append(time.perf_counter() - began)
+            return float(np.median(spent))
+
+        def change(k: int, session: cs.Session = session) -> None:
+            session.change("a1", "goal", center=[0.5 + 1e-3 * k, 0.0])
+
+        timed(change)
+        pairs = [(timed(lambda _: None), timed(change)) for _ in range(5)]
+        rows.append([f"{n:,}", f"{np.median([changed / plain for plain, changed in pairs]):.2f}"])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three teams, two drifts")
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
+    args = parser.parse_args()
+    seeds, drifts = (range(3), (0.005, 0.02)) if args.quick else (range(20), DRIFTS)
+    found: dict[tuple[str, float], list[dict[str, float]]] = {}
+    for drift in drifts:
+        teams = [moving_team(seed, drift) for seed in seeds]
+        for name, method in METHODS.items():
+            began = time.perf_counter()
+            found[name, drift] = [method(team, seed) for seed, team in zip(seeds, teams, strict=True)]
+            shares = [each["share"] for each in found[name, drift]]
+            print(
+                f"drift {drift:.2%} {name}: {np.mean(shares):.2%} of the rounds, worst team {min(shares):.2%}, {time.perf_counter() - began:.0f} s",
+                flush=True,
+            )
+    rows = [
+        [f"{drift:.2%}", name, f"{np.mean([e['share'] for e in each]):.2%}", f"{min(e['share'] for e in each):.2%}",
+         f"{np.median([e['worst'] for e in each]):.2f}"]
+        for (name, drift), each in found.items()
+    ]  # fmt: skip
+    again, dear = recovery(range(2 if args.quick else 5)), costs()
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "online.md").write_text(report(rows, again, dear, len(seeds)))
+    picture(found, drifts, args.out / "online.png")
+
+
+def report(rows: list[list[Any]], again: list[list[Any]], dear: list[list[Any]], count: int) -> str:
+    return f"""# Teams whose goals move, and teams that change
+
+`python benchmarks/online.py` on {machine()}; {count} random teams of 4 to 12 agents for each drift, {RATE:g} rounds a second for {DURATION:g} s,
+best margin at least {LEAST:g} at all times. Drift: how far a goal moves in a round, in its radii. Share: of the rounds after the first in which every
+constraint held, those in which every constraint holds.
+
+![Share of the rounds satisfied against the drift](online.png)
+
+{table(["drift", "method", "share, mean", "share, worst team", "worst margin, median"], rows)}
+
+Central: one cone program for the whole team, which nobody could solve on board, since it reads everybody's constraints. Gradient: ascent on
+the smooth margin of the whole team, one step a round, at the best of 13 step lengths for each team.
+
+## After a change
+
+Rounds until every constraint holds for good, in a session that goes on, and from a fresh start of the team as it then is.
+
+{table(["change", "session, median", "worst", "fresh, median", "worst"], again)}
+
+## What a changed parameter costs
+
+A change and a round, over a round without: medians of 60, five times in turn.
+
+{table(["agents", "ratio"], dear)}
+"""
+
+
+def picture(found: dict[tuple[str, float], list[dict[str, float]]], drifts: Sequence[float], path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    colours = ["#0072B2", "#56B4E9", "#999999", "#555555", "#D55E00"]
+    for name, colour in zip(METHODS, colours, strict=True):
+        mean = [100 * np.mean([each["share"] for each in found[name, drift]]) for drift in drifts]
+        axes.plot([100 * drift for drift in drifts], mean, marker="o", color=colour, label=name)
+    axes.set_xscale("log")
+    axes.set_xticks([100 * drift for drift in drifts], [f"{100 * drift:g}" for drift in drifts])
+    axes.minorticks_off()
+    axes.set_xlabel("drift of the goals, % of their radius a round")
+    axes.set_ylabel("rounds in which every constraint holds, %")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=150)
+
+
+if __name__ == "__main__":
+    main()
