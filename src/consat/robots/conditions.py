@@ -1,0 +1,75 @@
+"""What must hold for the theorem of docs/robots.md, and which of it does not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from consat.numerics import float64
+from consat.robots.drive import Drive, Report, longest_halt
+
+
+@float64
+def conditions(
+    drive: Drive, state: Any, *, noise: float = 0.0, wind: float = 0.0, paused: float = 0.0, report: Report | None = None
+) -> tuple[str, ...]:
+    """The conditions of the theorem that do not hold, one sentence each; empty where nothing can touch.
+
+    Args:
+        drive: the robot layer.
+        state: of the robots at the start.
+        noise: the most that a measured position is wrong by, m.
+        wind: speed of the air, m/s.
+        paused: the longest that a command was held beyond `drive.dt`, s.
+        report: of a run; None before it.
+    """
+    model, count, dt = drive.model, drive.count, drive.dt
+    broken = []
+    if noise > drive.noise:
+        broken.append(f"noise: positions are measured to {noise:g} m, but the filter allows for {drive.noise:g} m")
+    if drive.noise > 0.0 and model.inertial:
+        broken.append("noise: for robots that cannot halt at once, nothing is proven where positions are measured with noise")
+    if paused > 0.0:
+        broken.append(f"sampling: a command was held {dt + paused:g} s, but the filter allows for {dt:g} s")
+    if wind > 0.0 and _drifts(drive, wind):
+        broken.append(f"wind: {wind:g} m/s moves robots by what no command asked for")
+    pace, size = np.asarray(model.pace(count)), drive.size
+    least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(longest_halt(model, count)) + 2.0 * drive.noise)
+    if drive.sensing is not None and drive.sensing < least:
+        broken.append(f"sensing: the range is {drive.sensing:g} m, but must be {least:.4g} m")
+    place = model.place(state)
+    if model.inertial and bool(jnp.any(jnp.linalg.norm(model.stop(state) - place, axis=1) > 0.0)):
+        broken.append("start: robots must be at rest")
+    touching = _overlaps(drive, np.asarray(place))
+    if touching:
+        broken.append(f"start: {touching}")
+    if report is not None and float(report.strayed) > 0.0:
+        broken.append(f"tube: a body was {float(report.strayed):.3g} m farther from its reference than the filter allows for")
+    return tuple(broken)
+
+
+def _drifts(drive: Drive, wind: float) -> bool:
+    """Whether the air moves what the filter keeps apart, after one step at rest."""
+    state = drive.model.start(jnp.zeros((drive.count, drive.dimension)))
+    still = drive.model.halt(state, drive.dt)
+    air = jnp.full((drive.count, drive.dimension), wind)
+    after = jax.block_until_ready(drive.model.step(state, still, drive.dt, air))
+    return bool(jnp.any(drive.model.place(after) != drive.model.place(state)))
+
+
+def _overlaps(drive: Drive, place: np.ndarray) -> str | None:
+    """Who starts nearer to another, or to an obstacle, than the filter keeps."""
+    from scipy.spatial import cKDTree
+
+    size = np.asarray(drive.model.size(drive.count, drive.dt))
+    for first, second in sorted(cKDTree(place).query_pairs(2.0 * float(size.max()))):
+        gap = float(np.linalg.norm(place[first] - place[second]) - size[first] - size[second])
+        if gap < 0.0:
+            return f"robots {first} and {second} are {-gap:.3g} m nearer to each other than the filter keeps"
+    clear = np.asarray(drive.map.signed_distance(jnp.asarray(place))) - size
+    if clear.min(initial=np.inf) < 0.0:
+        return f"robot {int(np.argmin(clear))} is {-clear.min():.3g} m nearer to an obstacle than the filter keeps"
+    return None

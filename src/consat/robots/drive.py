@@ -1,0 +1,304 @@
+"""One control step of a team of robots: from where they want to be to what they do, and what came of it.
+
+What each robot does depends on its own state and target, the public map, and what it measures of its neighbours; the arrays only hold all
+robots at once. `Drive.step` can be traced, with arrays of constant shape; paths round obstacles are planned apart (`planning`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.errors import Fault, InvalidInput
+from consat.numerics import float64
+from consat.robots import deadlock
+from consat.robots import filter as safety
+from consat.robots.deadlock import Rules
+from consat.robots.model import LARGEST, Model, along, each
+from consat.robots.neighbours import Candidates, candidates, near
+from consat.robots.obstacles import Map, map_of
+
+PAIRS_COUNTED = 4000
+"""Up to so many robots every pair is remembered that ever touched; of more, touches are counted."""
+PATIENCE = 5.0
+"""A robot that is underway and came no nearer to its target for so long, s, is stuck."""
+
+
+class Memory(NamedTuple):
+    """What is carried from step to step; all but `known`, which only saves time, and `touched` is each robot's own.
+
+    Attributes:
+        velocity: (N, d) as others measured it last.
+        blocked: (N,) right angles that each turns its wish by.
+        waypoint: (N,) the next waypoint of each path.
+        goal: (N, d) the target that `least` is about.
+        least: (N,) the shortest way left so far, m.
+        waited: (N,) since when it got no shorter, s.
+        known: who may be near.
+        touched: (N, N) pairs that ever touched; (0, 0) where they are only counted.
+        report: what came of it so far.
+    """
+
+    velocity: Array
+    blocked: Array
+    waypoint: Array
+    goal: Array
+    least: Array
+    waited: Array
+    known: Candidates
+    touched: Array
+    report: Report
+
+
+class Report(NamedTuple):
+    """From the start to now; all scalars unless said otherwise.
+
+    Attributes:
+        smallest_distance: between two bodies' surfaces, m; infinite where there is no second body.
+        clearance: from a body's surface to the nearest obstacle, m; infinite where there is none.
+        contacts: how many pairs ever touched (touches, of very many robots).
+        collisions: how many times a robot touched an obstacle, in steps.
+        halted: (N,) how many steps each robot was halted by the filter.
+        strayed: the farthest that a body was from where the filter took it to be, beyond what it allows for, m.
+    """
+
+    smallest_distance: Array
+    clearance: Array
+    contacts: Array
+    collisions: Array
+    halted: Array
+    strayed: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """The robot layer of a team.
+
+    Args:
+        model: a model, or a `Fleet` of several.
+        count: N.
+        dimension: d.
+        dt: time between two commands, s.
+        obstacles: public map.
+        noise: the most that a measured position may be wrong by, m; widens what is kept.
+        share: of a gap that may be used up in a step, in (0, 1].
+        neighbours: how many have a plane of their own; the others limit the speed.
+        parts: of obstacles, likewise.
+        sensing: range of the sensors, m; None for as far as the rules below look.
+        tolerance: a robot nearer to its target than this has arrived, m; None for its radius.
+        rules: against deadlock.
+
+    Attributes:
+        map: the obstacles as arrays.
+        size: (N,) the radius that each keeps round its place, m.
+        range: how far each looks, m.
+
+    Raises:
+        InvalidInput: a setting, or an obstacle, that cannot be used.
+    """
+
+    model: Model[Any]
+    count: int
+    dimension: int
+    dt: float
+    obstacles: Sequence[Any] = ()
+    noise: float = 0.0
+    share: float = 1.0
+    neighbours: int = 8
+    parts: int = 4
+    sensing: float | None = None
+    tolerance: float | None = None
+    rules: Rules = field(default_factory=Rules)
+    map: Map = field(init=False)
+    size: np.ndarray = field(init=False)
+    range: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        faults = []
+        kind = type(self.model).__name__.lower()
+        if self.dimension not in self.model.dimensions:
+            allowed = " or ".join(map(str, self.model.dimensions))
+            faults.append(Fault(("robots", "kind"), f"{kind} robots move in {allowed} dimensions, but the team has {self.dimension}"))
+        for name, low in (("dt", 0.0), ("share", 0.0), ("noise", -1.0)):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > low) or (name == "share" and value > 1.0) or (name == "noise" and value < 0.0):
+                allowed = {"dt": "positive", "share": "above 0 and at most 1", "noise": "0 or more"}[name]
+                faults.append(Fault(("robots", name), f"must be {allowed}, but is {value:g}"))
+        if faults:
+            raise InvalidInput(faults)
+        object.__setattr__(self, "map", map_of(self.obstacles, self.dimension))
+        size, look = _sizes(self)
+        object.__setattr__(self, "size", size)
+        object.__setattr__(self, "range", look)
+
+    def start(self, state: Any) -> Memory:
+        """The memory at the start."""
+        place = self.model.place(state)
+        zeros, none = jnp.zeros(self.count), jnp.asarray(jnp.inf)
+        pairs = self.count if self.count <= PAIRS_COUNTED else 0
+        report = Report(none, none, jnp.asarray(0), jnp.asarray(0), jnp.zeros(self.count, dtype=jnp.int64), jnp.asarray(0.0))
+        memory = Memory(
+            jnp.zeros_like(place),
+            zeros,
+            jnp.zeros(self.count, dtype=jnp.int64),
+            jnp.full_like(place, LARGEST),
+            jnp.full(self.count, jnp.inf),
+            zeros,
+            candidates(place),
+            jnp.zeros((pairs, pairs), dtype=bool),
+            report,
+        )
+        return self._looked_at(state, memory)
+
+    def step(
+        self,
+        state: Any,
+        memory: Memory,
+        targets: Array,
+        *,
+        paths: Array | None = None,
+        measured: Array | None = None,
+        wind: Array | None = None,
+    ) -> tuple[Any, Memory, Array]:
+        """One step of dt.
+
+        Args:
+            state: of the model.
+            memory: from the last step, or `start`.
+            targets: (N, d) where each wants to be.
+            paths: (N, W, d) waypoints, the last of which are the targets; None to go straight.
+            measured: (N, d) measured positions, wrong by at most `noise`; None for the true ones.
+            wind: (N, d) velocity of the air; None for none.
+
+        Returns:
+            state and memory after the step, and the command, (N, m).
+        """
+        model, dt, size = self.model, self.dt, jnp.asarray(self.size)
+        true = model.place(state)
+        place = true if measured is None else measured
+        stop = place + (model.stop(state) - true) if model.inertial else None
+        top = model.pace(self.count)
+        known, around = near(memory.known, place, self.neighbours, self.range)
+        planes = safety.neighbour_planes(place, stop, size, around, self.share)
+        everything = planes
+        if self.map.count:
+            everything = safety.joined(planes, safety.obstacle_planes(place, stop, size, self.map, self.parts, self.share))
+        if measured is not None:  # a robot moves by what it measures of itself
+            everything = everything._replace(least=everything.least + along(everything.normals, true - place))
+
+        waypoint, ahead, left = self._way(memory.waypoint, place, targets, paths)
+        underway = jnp.linalg.norm(targets - place, axis=1) >= self._tolerance()
+        pace = model.approach(left, dt)
+        seen = deadlock.sight(planes, place, size, memory.velocity, underway, around)
+        straight = safety.open_way(model, state, ahead * pace[:, None], everything, dt)
+        wish = deadlock.bent(self.rules, ahead, pace, top, underway=underway, blocked=memory.blocked, seen=seen)
+        blocked = deadlock.refused(self.rules, memory.blocked, ahead, pace, straight, underway=underway, dt=dt)
+        command, moves = safety.filtered(model, state, wish, everything, dt)
+        after = model.step(state, command, dt, wind)
+
+        anew = jnp.linalg.norm(targets - memory.goal, axis=1) > self._tolerance()
+        nearer = left < memory.least - 0.1 * self._tolerance()
+        memory = memory._replace(
+            velocity=model.velocity(state, command),
+            blocked=blocked,
+            waypoint=waypoint,
+            goal=jnp.where(anew[:, None], targets, memory.goal),
+            least=jnp.where(anew | nearer, left, memory.least),
+            waited=jnp.where(anew | nearer | ~underway, 0.0, memory.waited + dt),
+            known=known,
+            report=memory.report._replace(halted=memory.report.halted + (~moves).astype(jnp.int64)),
+        )
+        return after, self._looked_at(after, memory), command
+
+    def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
+        """Who has not arrived, and came no nearer to the target for `PATIENCE`, by index."""
+        underway = jnp.linalg.norm(targets - self.model.place(state), axis=1) >= self._tolerance()
+        return np.flatnonzero(np.asarray(underway & (memory.waited > PATIENCE))).tolist()
+
+    def arrived(self, state: Any, targets: Array) -> Array:
+        """(N,) who is within `tolerance` of its target."""
+        return jnp.linalg.norm(targets - self.model.place(state), axis=1) < self._tolerance()
+
+    def _tolerance(self) -> Array:
+        return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
+
+    def _way(self, waypoint: Array, place: Array, targets: Array, paths: Array | None) -> tuple[Array, Array, Array]:
+        """The next waypoint (N,), the unit vector to it (N, d), and the length of the way that is left (N,), m.
+
+        A waypoint is passed where its own distance is less than the body's size, or where the robot is beyond it, seen along what follows.
+        """
+        if paths is None:
+            target, rest = targets, jnp.zeros(self.count)
+        else:
+            last = paths.shape[1] - 1
+            size = jnp.asarray(self.size)
+            legs = jnp.linalg.norm(jnp.diff(paths, axis=1), axis=2)
+            rests = jnp.concatenate([jnp.cumsum(legs[:, ::-1], axis=1)[:, ::-1], jnp.zeros((self.count, 1))], axis=1)
+            here, next_ = _row(paths, waypoint), _row(paths, jnp.minimum(waypoint + 1, last))
+            distance = jnp.linalg.norm(here - place, axis=1)
+            beyond = jnp.sum((next_ - here) * (place - here), axis=1) > 0.0
+            passed = (distance < 0.5 * size) | (beyond & (distance < 3.0 * size))
+            waypoint = jnp.minimum(waypoint + passed.astype(waypoint.dtype), last)
+            target, rest = _row(paths, waypoint), _row(rests, waypoint)
+        way = target - place
+        length = jnp.linalg.norm(way, axis=1)
+        return waypoint, way / jnp.maximum(length, 1e-9)[:, None], length + rest
+
+    def _looked_at(self, state: Any, memory: Memory) -> Memory:
+        """The report brought up to date with where bodies are."""
+        body, place = self.model.body(state), self.model.place(state)
+        radius, report = each(self.model.radius, self.count), memory.report
+        stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - self.model.size(self.count, self.dt))
+        report = report._replace(strayed=jnp.maximum(report.strayed, stray))
+        if self.map.count:
+            clear = self.map.signed_distance(body) - radius
+            report = report._replace(
+                clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + jnp.sum(clear < 0.0)
+            )
+        if self.count == 1:
+            return memory._replace(report=report)
+        known, around = near(memory.known, place, self.neighbours, jnp.inf)
+        there = around.who < self.count
+        index = jnp.minimum(around.who, self.count - 1)
+        gap = jnp.sqrt(jnp.sum((body[:, None] - body[index]) ** 2, axis=2)) - radius[:, None] - radius[index]
+        gap = jnp.where(there, gap, jnp.inf)
+        touching = gap < 0.0
+        if len(memory.touched):
+            rows = jnp.broadcast_to(jnp.arange(self.count, dtype=index.dtype)[:, None], index.shape)
+            touched = memory.touched.at[jnp.minimum(rows, index), jnp.maximum(rows, index)].max(touching)
+            contacts = jnp.where(jnp.any(touching), jnp.sum(touched), report.contacts)
+        else:
+            touched, contacts = memory.touched, report.contacts + jnp.sum(touching) // 2
+        report = report._replace(smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap)), contacts=contacts)
+        return memory._replace(touched=touched, known=known, report=report)
+
+
+@float64
+def _sizes(drive: Drive) -> tuple[np.ndarray, float]:
+    """`size` and `range`."""
+    model, count, dt = drive.model, drive.count, drive.dt
+    with jax.ensure_compile_time_eval():
+        size = np.asarray(model.size(count, dt)) + safety.margin(model, count, dt, drive.noise, drive.share)
+        if drive.sensing is not None:
+            return size, drive.sensing
+        look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
+        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count)))
+
+
+def longest_halt(model: Model[Any], count: int) -> np.ndarray:
+    """(N,) the way that a halt from full speed takes, m."""
+    if not model.inertial:
+        return np.zeros(count)
+    return np.asarray(model.pace(count)) ** 2 / (2.0 * np.asarray(model.braking(count)))
+
+
+def _row(rows: Array, index: Array) -> Array:
+    """(N, W, …) and (N,) → (N, …)."""
+    return rows[jnp.arange(len(index)), index]

@@ -1,0 +1,131 @@
+"""Robots of several kinds as one model: each kind computes for its own, and what all share is put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.errors import Fault, InvalidInput, counted
+from consat.robots.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Several models, and which robots are of which.
+
+    The state is a tuple with that of each model; a command has as many columns as the widest needs, the others are 0.
+
+    Args:
+        models: the kinds; parameters given for each robot are in the order of that kind's own robots.
+        kinds: (N,) the model of each robot, by index.
+
+    Raises:
+        InvalidInput: a kind that is not there, or that no robot has.
+    """
+
+    models: Sequence[Model[Any]]
+    kinds: np.ndarray
+    members: tuple[np.ndarray, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        kinds = np.asarray(self.kinds)
+        if kinds.ndim != 1 or sorted(set(kinds.tolist())) != list(range(len(self.models))):
+            text = (
+                f"must name each of {counted(len(self.models), 'model')} by its index at least once, but has {sorted(set(kinds.tolist()))}"
+            )
+            raise InvalidInput([Fault(("kinds",), text, "fleet")])
+        object.__setattr__(self, "kinds", kinds)
+        object.__setattr__(self, "members", tuple(np.flatnonzero(kinds == kind) for kind in range(len(self.models))))
+
+    @property
+    def dimensions(self) -> tuple[int, ...]:
+        return tuple(sorted(set.intersection(*(set(model.dimensions) for model in self.models))))
+
+    @property
+    def inertial(self) -> bool:
+        return any(model.inertial for model in self.models)
+
+    @property
+    def radius(self) -> np.ndarray:
+        return self._host(lambda model, count: np.broadcast_to(np.asarray(model.radius), (count,)))
+
+    def start(self, position: Array) -> tuple[Any, ...]:
+        return tuple(model.start(position[rows]) for model, rows in zip(self.models, self.members, strict=True))
+
+    def place(self, state: tuple[Any, ...]) -> Array:
+        return self._joined([model.place(part) for model, part in zip(self.models, state, strict=True)])
+
+    def body(self, state: tuple[Any, ...]) -> Array:
+        return self._joined([model.body(part) for model, part in zip(self.models, state, strict=True)])
+
+    def heading(self, state: tuple[Any, ...]) -> Array:
+        return self._joined([model.heading(part) for model, part in zip(self.models, state, strict=True)])
+
+    def stop(self, state: tuple[Any, ...]) -> Array:
+        return self._joined([model.stop(part) for model, part in zip(self.models, state, strict=True)])
+
+    def velocity(self, state: tuple[Any, ...], command: Array) -> Array:
+        return self._mapped(lambda model, part, rows: model.velocity(part, self._own(model, part, command[rows])), state)
+
+    def size(self, count: int, dt: float) -> Array:
+        return self._joined([model.size(len(rows), dt) for model, rows in zip(self.models, self.members, strict=True)])
+
+    def pace(self, count: int) -> Array:
+        return self._joined([model.pace(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
+
+    def braking(self, count: int) -> Array:
+        return self._joined([model.braking(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
+
+    def command(self, state: tuple[Any, ...], velocity: Array, dt: float) -> Array:
+        return self._mapped(lambda model, part, rows: model.command(part, velocity[rows], dt), state)
+
+    def halt(self, state: tuple[Any, ...], dt: float) -> Array:
+        return self._mapped(lambda model, part, rows: model.halt(part, dt), state)
+
+    def step(self, state: tuple[Any, ...], command: Array, dt: float, wind: Array | None = None) -> tuple[Any, ...]:
+        return tuple(
+            model.step(part, self._own(model, part, command[rows]), dt, None if wind is None else wind[rows])
+            for model, part, rows in zip(self.models, state, self.members, strict=True)
+        )
+
+    def lowest(self, state: tuple[Any, ...], command: Array, normals: Array, dt: float) -> Array:
+        return self._mapped(lambda model, part, rows: model.lowest(part, self._own(model, part, command[rows]), normals[rows], dt), state)
+
+    def rows(self, state: tuple[Any, ...], normals: Array, least: Array, dt: float) -> Array:
+        return self._mapped(lambda model, part, rows: model.rows(part, normals[rows], least[rows], dt), state)
+
+    def farthest(self, state: tuple[Any, ...], command: Array, dt: float) -> Array:
+        return self._mapped(lambda model, part, rows: model.farthest(part, self._own(model, part, command[rows]), dt), state)
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        return self._joined([model.bounded(slack[rows], dt) for model, rows in zip(self.models, self.members, strict=True)])
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        return self._joined([model.approach(distance[rows], dt) for model, rows in zip(self.models, self.members, strict=True)])
+
+    def reach(self, state: tuple[Any, ...], dt: float) -> tuple[Array, Array]:
+        parts = [model.reach(part, dt) for model, part in zip(self.models, state, strict=True)]
+        return self._joined([center for center, _ in parts]), self._joined([radius for _, radius in parts])
+
+    def _own(self, model: Model[Any], part: Any, command: Array) -> Array:
+        """The columns of a command that a model has."""
+        return command[:, : model.halt(part, 1.0).shape[1]]
+
+    def _mapped(self, function: Callable[[Model[Any], Any, np.ndarray], Array], state: tuple[Any, ...]) -> Array:
+        return self._joined([function(model, part, rows) for model, part, rows in zip(self.models, state, self.members, strict=True)])
+
+    def _joined(self, parts: list[Array]) -> Array:
+        """Rows of each kind in the order of the robots; narrower ones are filled up with 0."""
+        if parts[0].ndim == 2:
+            width = max(part.shape[1] for part in parts)
+            parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
+        return jnp.concatenate(parts)[np.argsort(np.concatenate(self.members))]
+
+    def _host(self, function: Callable[[Model[Any], int], np.ndarray]) -> np.ndarray:
+        parts = [function(model, len(rows)) for model, rows in zip(self.models, self.members, strict=True)]
+        return np.concatenate(parts)[np.argsort(np.concatenate(self.members))]

@@ -1,0 +1,168 @@
+"""What every robot model offers, and how its parameters are checked.
+
+A model holds parameters only; the state is passed in and returned. All functions take N robots at once, N = 1 in a process of its own, and
+can be traced by JAX. Positions have shape (N, d), in metres; times are in seconds and angles in radians.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import operator
+from typing import Any, Generic, Protocol, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.errors import Fault, InvalidInput, shown
+
+Number = float | np.ndarray
+"""A parameter: one number for all robots, or (N,) one for each."""
+
+S = TypeVar("S")
+"""The state of a model: a NamedTuple of arrays whose first axis is the robot."""
+
+LARGEST = 1e6
+"""Parameters beyond this are refused: their squares must stay far from where float64 ends."""
+
+
+class Model(Protocol, Generic[S]):
+    """A robot model.
+
+    `place` is the point that constraints see and that the safety filter keeps apart from others by `size`. A robot that halts from now on
+    stays on the segment from `place` to `stop`; where it can halt at once, that is one point.
+    """
+
+    @property
+    def dimensions(self) -> tuple[int, ...]:
+        """The dimensions of space in which the model is defined."""
+
+    @property
+    def inertial(self) -> bool:
+        """Whether a robot that halts moves on for a while; where not, `stop` is `place`."""
+
+    @property
+    def radius(self) -> Number:
+        """Of the body, m."""
+
+    def start(self, position: Array) -> S:
+        """The state at rest whose `place` is `position`, (N, d)."""
+
+    def place(self, state: S) -> Array:
+        """(N, d) the point that constraints see."""
+
+    def body(self, state: S) -> Array:
+        """(N, d) the center of the body's disc or ball, whose radius is `radius`."""
+
+    def velocity(self, state: S, command: Array) -> Array:
+        """(N, d) velocity of `place` as others would measure it, under the command."""
+
+    def heading(self, state: S) -> Array:
+        """(N,) angle of the body in the plane, for drawings."""
+
+    def stop(self, state: S) -> Array:
+        """(N, d) where `place` comes to rest if the robot halts from now on."""
+
+    def size(self, count: int, dt: float) -> Array:
+        """(N,) radius of a disc around `place` that holds the body all through a step of `dt` whose ends the filter has checked."""
+
+    def pace(self, count: int) -> Array:
+        """(N,) the speed limit."""
+
+    def braking(self, count: int) -> Array:
+        """(N,) deceleration of a halt, m/s²; infinite where a robot halts at once."""
+
+    def command(self, state: S, velocity: Array, dt: float) -> Array:
+        """(N, m) the command within the model's limits whose mean velocity over `dt` is `velocity`, or points the same way where that is
+        out of reach."""
+
+    def halt(self, state: S, dt: float) -> Array:
+        """(N, m) the command that stops as soon as the limits allow."""
+
+    def step(self, state: S, command: Array, dt: float, wind: Array | None = None) -> S:
+        """The state after `dt` under a command that is held; commands beyond the limits are cut to them. `wind` is the velocity of the
+        air, (N, d), or None where there is none."""
+
+    def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
+        """(N, k) the least n·x, for k unit vectors (N, k, d) of each robot, that `place` comes to after this moment: within the step, at its
+        end, or in the halt that may follow. Without wind."""
+
+    def rows(self, state: S, normals: Array, least: Array, dt: float) -> Array:
+        """(N, k) b such that n·u ≥ b, for the next velocity u, keeps the step and the halt after it in n·x ≥ `least`."""
+
+    def farthest(self, state: S, command: Array, dt: float) -> Array:
+        """(N,) a bound on how far from where it is now `place` comes within the step and the halt that may follow. Without wind."""
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        """(N,) the speed at which a step and the halt after it take no more than `slack`, m."""
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        """(N,) the speed at which to be, this far before the end of the way."""
+
+    def reach(self, state: S, dt: float) -> tuple[Array, Array]:
+        """Center (N, d) and radius (N,) of a ball of velocities that can be reached within `dt`."""
+
+
+def each(value: Number, count: int) -> Array:
+    """(N,) of a parameter that is one number for all or one for each."""
+    return jnp.broadcast_to(jnp.asarray(value, dtype=jnp.float64), (count,))
+
+
+def shortened(vectors: Array, limit: Array) -> Array:
+    """Vectors (N, d) no longer than `limit`, (N,), in the same directions."""
+    length = jnp.linalg.norm(vectors, axis=1)
+    return vectors * jnp.where(length > limit, limit / jnp.where(length > 0.0, length, 1.0), 1.0)[:, None]
+
+
+def along(normals: Array, points: Array) -> Array:
+    """(N, k) n·x for k vectors (N, k, d) and one point (N, d) of each robot."""
+    return functools.reduce(operator.add, [normals[:, :, axis] * points[:, axis][:, None] for axis in range(points.shape[1])])
+
+
+def checked(model: Any) -> None:
+    """Check that each field of a model is a positive number or a vector of them, one for each robot, and store vectors as float64.
+
+    Fields whose metadata has ``zero`` may be 0; those with ``below`` must be smaller than that.
+
+    Raises:
+        InvalidInput: one line a field that cannot be used.
+    """
+    kind, faults, lengths = type(model).__name__.lower(), [], {}
+    for field in dataclasses.fields(model):
+        value = getattr(model, field.name)
+        fault = _fault(value, bool(field.metadata.get("zero")), float(field.metadata.get("below", math.inf)))
+        if fault:
+            faults.append(Fault((field.name,), fault, f"robot {kind!r}, {field.name}"))
+        elif isinstance(value, (list, tuple, np.ndarray)):
+            array = np.array(value, dtype=float)
+            array.setflags(write=False)
+            lengths[field.name] = len(array)
+            object.__setattr__(model, field.name, array)
+        else:
+            object.__setattr__(model, field.name, float(value))
+    if len(set(lengths.values())) > 1:
+        text = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        faults.append(Fault((), f"parameters given for each robot must have one length, but have {text}", f"robot {kind!r}"))
+    if faults:
+        raise InvalidInput(faults)
+
+
+def _fault(value: Any, zero: bool, below: float) -> str | None:
+    """What is wrong with a parameter, or None."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        return f"must be a number or one number for each robot, but is {shown(value)}"
+    if array.dtype.kind not in "iuf" or array.ndim > 1 or array.size == 0:
+        return f"must be a number or one number for each robot, but is {shown(value)}"
+    if not (np.isfinite(array).all() and (np.abs(array) <= LARGEST).all()):
+        return f"must be finite and at most {LARGEST:g}, but is {shown(value)}"
+    if zero and (array < 0).any():
+        return f"must not be negative, but is {shown(value)}"
+    if not zero and (array <= 0).any():
+        return f"must be positive, but is {shown(value)}"
+    if (array >= below).any():
+        return f"must be below {below:.4g}, but is {shown(value)}"
+    return None

@@ -1,0 +1,204 @@
+"""Ways round obstacles, planned on the host by each robot from the public map.
+
+In the plane: a visibility graph between the corners of the obstacles, grown by the body's radius and a clearance, is built once for a map
+(Lozano-Pérez and Wesley, 1979); a path is a shortest path in it. In space: a grid, and its shortest path made straight where nothing is in
+the way. Shortest paths are SciPy's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+import shapely
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from consat.numerics import float64
+from consat.robots.obstacles import Map
+
+CORNERS = 2
+"""Corners of a quarter circle that stands for that of a grown obstacle."""
+CELLS = 40_000
+"""Of the grid in space, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """Plans paths for bodies of one size on one map.
+
+    Args:
+        obstacles: the map.
+        size: the radius that a robot keeps, m.
+        clearance: how much farther off paths are planned, m; None for a quarter of the size.
+    """
+
+    obstacles: Map
+    size: float
+    clearance: float | None = None
+    _roads: _Roads | _Grid = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        clearance = 0.25 * self.size if self.clearance is None else self.clearance
+        plane = self.obstacles.dimension == 2
+        roads = _Roads(self.obstacles, self.size, clearance) if plane else _Grid(self.obstacles, self.size, clearance)
+        object.__setattr__(self, "_roads", roads)
+
+    def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """(W, d) waypoints from a start, (d,), to a goal, (d,), which is the last; the goal alone where it can be seen, or where no way
+        leads to it: the safety filter sees to it that nothing is touched."""
+        return self._roads.path(np.asarray(start, dtype=float), np.asarray(goal, dtype=float))
+
+    def paths(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """(N, W, d) as `path`, one for each of N robots, filled up with the goal; W is a power of 2, so that few programs are compiled."""
+        found = [self.path(start, goal) for start, goal in zip(starts, goals, strict=True)]
+        width = 1 << max(max(map(len, found), default=1) - 1, 0).bit_length()
+        return np.stack([np.concatenate([path, np.repeat(path[-1:], width - len(path), axis=0)]) for path in found])
+
+    def stale(self, paths: np.ndarray, goals: np.ndarray, tolerance: float) -> bool:
+        """Whether a goal has moved from where its path ends by more than `tolerance`, m."""
+        return bool(np.any(np.linalg.norm(paths[:, -1] - goals, axis=1) > tolerance))
+
+
+class _Roads:
+    """Corners of grown obstacles, and which of them see each other."""
+
+    def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
+        shapes = [
+            shapely.Point(*center).buffer(radius, quad_segs=16) for center, radius in zip(obstacles.centers, obstacles.radii, strict=True)
+        ]
+        shapes += [shapely.box(*low, *high) for low, high in zip(obstacles.lows, obstacles.highs, strict=True)]
+        shapes += [shapely.Polygon(obstacles.begins[first:last]) for first, last in obstacles.polygons]
+        solid = shapely.union_all(shapes)
+        self.walls = shapely.buffer(solid, size, quad_segs=16)
+        # Chords of few corners cut into the circle that they stand for: from farther out they don't.
+        reach = (size + clearance) / math.cos(math.pi / (4 * CORNERS))
+        grown = shapely.buffer(solid, reach, quad_segs=CORNERS).simplify(0.1 * clearance)
+        rings = shapely.get_rings(shapely.get_parts(grown))
+        corners = np.concatenate([np.zeros((0, 2)), *(shapely.get_coordinates(ring)[:-1] for ring in rings)])
+        shapely.prepare(self.walls)
+        self.corners = corners[~shapely.intersects_xy(self.walls, *corners.T)] if len(corners) else corners
+        first, second = np.triu_indices(len(self.corners), 1)
+        seen = self._clear(self.corners[first], self.corners[second])
+        first, second = first[seen], second[seen]
+        length = np.linalg.norm(self.corners[first] - self.corners[second], axis=1)
+        count = len(self.corners)
+        self.graph = csr_array(coo_array((np.r_[length, length], (np.r_[first, second], np.r_[second, first])), shape=(count, count)))
+        self.trees: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def _clear(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Which of the straight ways (M, 2) to (M, 2) lead past all walls."""
+        if len(first) == 0:
+            return np.zeros(0, dtype=bool)
+        return ~shapely.intersects(self.walls, shapely.linestrings(np.stack([first, second], axis=1)))
+
+    def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        start_out, goal_out = self._outside(start), self._outside(goal)
+        if len(self.corners) == 0 or self._clear(start_out[None], goal_out[None])[0]:
+            return goal[None]
+        near_start, near_goal = self._seen_from(start_out), self._seen_from(goal_out)
+        if not (np.isfinite(near_start).any() and np.isfinite(near_goal).any()):
+            return goal[None]
+        rest, following = self._to(near_goal)
+        total = near_start + rest
+        corner = int(np.argmin(total))
+        if not np.isfinite(total[corner]):
+            return goal[None]
+        way = []
+        while corner >= 0:
+            way.append(self.corners[corner])
+            corner = int(following[corner])
+        return np.array([*way, goal])
+
+    def _outside(self, point: np.ndarray) -> np.ndarray:
+        """The point itself, or, of one that is too near an obstacle, the nearest one that is not."""
+        place = shapely.Point(point)
+        if not shapely.intersects(self.walls, place):
+            return point
+        boundary = shapely.boundary(self.walls)
+        nearest = np.asarray(boundary.interpolate(boundary.project(place)).coords[0])
+        away = nearest - point
+        return nearest + 1e-6 * away / max(float(np.linalg.norm(away)), 1e-12)
+
+    def _seen_from(self, point: np.ndarray) -> np.ndarray:
+        """(V,) the distance to each corner, infinite to those that are not seen."""
+        seen = self._clear(np.broadcast_to(point, self.corners.shape), self.corners)
+        return np.where(seen, np.linalg.norm(self.corners - point, axis=1), np.inf)
+
+    def _to(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(V,) the length of the shortest way from each corner over one whose last leg has the length `ends`, and (V,) the corner that
+        comes next, −1 for the last."""
+        count = len(ends)
+        last = np.flatnonzero(np.isfinite(ends))
+        whole = self.graph.tocoo()
+        rows, columns = np.r_[whole.row, np.full(len(last), count)], np.r_[whole.col, last]
+        graph = csr_array(coo_array((np.r_[whole.data, ends[last]], (rows, columns)), shape=(count + 1, count + 1)))
+        rest, before = dijkstra(graph, indices=count, return_predecessors=True)
+        return rest[:count], np.where(before[:count] == count, -1, before[:count])
+
+
+class _Grid:
+    """A grid in space whose free nodes are joined to their 26 neighbours."""
+
+    def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
+        self.obstacles, self.size = obstacles, size
+        corners = np.concatenate(
+            [obstacles.centers - obstacles.radii[:, None], obstacles.centers + obstacles.radii[:, None], obstacles.lows, obstacles.highs]
+        )
+        if len(corners) == 0:
+            self.nodes = np.zeros((0, 3))
+            return
+        around = 3.0 * (size + clearance)
+        low, high = corners.min(axis=0) - around, corners.max(axis=0) + around
+        self.step = max(float(np.prod(high - low) / CELLS) ** (1 / 3), 0.5 * size)
+        axes = [np.arange(a, b + self.step, self.step) for a, b in zip(low, high, strict=True)]
+        shape = tuple(map(len, axes))
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        free = self._distance(nodes) > size + clearance
+        number = np.arange(len(nodes)).reshape(shape)
+        rows, columns = [], []
+        for move in itertools.product((-1, 0, 1), repeat=3):
+            if move > (0, 0, 0):
+                ahead = tuple(slice(max(m, 0), shape[axis] + min(m, 0)) for axis, m in enumerate(move))
+                behind = tuple(slice(max(-m, 0), shape[axis] + min(-m, 0)) for axis, m in enumerate(move))
+                rows.append(number[behind].ravel())
+                columns.append(number[ahead].ravel())
+        first, second = np.concatenate(rows), np.concatenate(columns)
+        fine = free[first] & free[second]
+        first, second = first[fine], second[fine]
+        length = np.linalg.norm(nodes[first] - nodes[second], axis=1)
+        self.graph = csr_array(coo_array((length, (first, second)), shape=(len(nodes), len(nodes))))
+        self.nodes, self.free = nodes, np.flatnonzero(free)
+
+    @float64
+    def _distance(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.obstacles.signed_distance(jnp.asarray(points)))
+
+    def _clear(self, first: np.ndarray, second: np.ndarray) -> bool:
+        """Whether a body can go straight; the distance to the nearest obstacle is sampled so finely that it can't be missed by more than
+        an eighth of the size, which paths keep clear."""
+        length = float(np.linalg.norm(second - first))
+        part = np.linspace(0.0, 1.0, max(2, math.ceil(length / (0.25 * self.size)) + 1))[:, None]
+        return bool(np.all(self._distance(first + part * (second - first)) > 1.1 * self.size))
+
+    def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        if len(self.nodes) == 0 or self._clear(start, goal):
+            return goal[None]
+        ends = [int(self.free[np.argmin(np.linalg.norm(self.nodes[self.free] - point, axis=1))]) for point in (start, goal)]
+        rest, before = dijkstra(self.graph, directed=False, indices=ends[1], return_predecessors=True)
+        if not np.isfinite(rest[ends[0]]):
+            return goal[None]
+        way, node = [start], ends[0]
+        while node != ends[1]:
+            way.append(self.nodes[node])
+            node = int(before[node])
+        way += [self.nodes[node], goal]
+        straight, here = [], 0
+        while here < len(way) - 1:
+            ahead = next((index for index in range(len(way) - 1, here, -1) if self._clear(way[here], way[index])), here + 1)
+            straight.append(way[ahead])
+            here = ahead
+        return np.array(straight)
