@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.robots.filter import Planes
-from consat.robots.model import along
+from consat.robots.model import along, dot
 from consat.robots.neighbours import Near
 
 
@@ -63,7 +63,7 @@ def sight(planes: Planes, place: Array, size: Array, velocity: Array, underway: 
     there = near.who < len(place)
     index = jnp.minimum(near.who, len(place) - 1)
     normals = planes.normals[:, : near.who.shape[1]]
-    gap = along(normals, place) - jnp.sum(normals * place[index], axis=2) - size[:, None] - size[index]
+    gap = along(normals, place) - dot(normals, place[index]) - size[:, None] - size[index]
     return Sight(normals, jnp.where(there, gap, jnp.inf), velocity[index], underway[index] & there)
 
 
@@ -80,7 +80,7 @@ def bent(rules: Rules, ahead: Array, pace: Array, top: Array, *, underway: Array
         seen: neighbours.
     """
     closeness = jnp.clip(1.0 - seen.gap / (rules.reach * top[:, None]), 0.0, 1.0)
-    closing = jnp.clip(-jnp.sum(((ahead * top[:, None])[:, None] - seen.velocity) * seen.away, axis=2) / top[:, None], 0.0, 1.0)
+    closing = jnp.clip(-dot((ahead * top[:, None])[:, None] - seen.velocity, seen.away) / top[:, None], 0.0, 1.0)
     closeness = closeness * (1.0 - rules.closing + rules.closing * closing)
     before = jnp.clip(-along(seen.away, ahead), 0.0, 1.0)
     round_ = jnp.sum((closeness * before)[..., None] * _quarter(seen.away, jnp.broadcast_to(ahead[:, None], seen.away.shape)), axis=1)

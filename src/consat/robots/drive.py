@@ -21,8 +21,8 @@ from consat.numerics import float64
 from consat.robots import deadlock
 from consat.robots import filter as safety
 from consat.robots.deadlock import Rules
-from consat.robots.model import LARGEST, Model, along, each
-from consat.robots.neighbours import Candidates, candidates, near
+from consat.robots.model import LARGEST, Model, along, each, squared
+from consat.robots.neighbours import Candidates, Near, candidates, near
 from consat.robots.obstacles import Map, map_of
 
 PAIRS_COUNTED = 4000
@@ -61,7 +61,7 @@ class Report(NamedTuple):
     """From the start to now; all scalars unless said otherwise.
 
     Attributes:
-        smallest_distance: between two bodies' surfaces, m; infinite where there is no second body.
+        smallest_distance: between the surfaces of two bodies in range of each other, m; infinite where there were none.
         clearance: from a body's surface to the nearest obstacle, m; infinite where there is none.
         contacts: how many pairs ever touched (touches, of very many robots).
         collisions: how many times a robot touched an obstacle, in steps.
@@ -155,7 +155,7 @@ class Drive:
             jnp.zeros((pairs, pairs), dtype=bool),
             report,
         )
-        return self._looked_at(state, memory)
+        return self.observed(state, memory)
 
     def step(
         self,
@@ -186,6 +186,7 @@ class Drive:
         stop = place + (model.stop(state) - true) if model.inertial else None
         top = model.pace(self.count)
         known, around = near(memory.known, place, self.neighbours, self.range)
+        memory = self._looked_at(state, memory, around)
         planes = safety.neighbour_planes(place, stop, size, around, self.share)
         everything = planes
         if self.map.count:
@@ -215,7 +216,12 @@ class Drive:
             known=known,
             report=memory.report._replace(halted=memory.report.halted + (~moves).astype(jnp.int64)),
         )
-        return after, self._looked_at(after, memory), command
+        return after, memory, command
+
+    def observed(self, state: Any, memory: Memory) -> Memory:
+        """The memory with the present state in the report, which otherwise ends where the last step began."""
+        known, around = near(memory.known, self.model.place(state), self.neighbours, self.range)
+        return self._looked_at(state, memory._replace(known=known), around)
 
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
         """Who has not arrived, and came no nearer to the target for `PATIENCE`, by index."""
@@ -251,8 +257,8 @@ class Drive:
         length = jnp.linalg.norm(way, axis=1)
         return waypoint, way / jnp.maximum(length, 1e-9)[:, None], length + rest
 
-    def _looked_at(self, state: Any, memory: Memory) -> Memory:
-        """The report brought up to date with where bodies are."""
+    def _looked_at(self, state: Any, memory: Memory, around: Near) -> Memory:
+        """The report brought up to date with where bodies are, given who is near."""
         body, place = self.model.body(state), self.model.place(state)
         radius, report = each(self.model.radius, self.count), memory.report
         stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - self.model.size(self.count, self.dt))
@@ -262,22 +268,21 @@ class Drive:
             report = report._replace(
                 clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + jnp.sum(clear < 0.0)
             )
-        if self.count == 1:
-            return memory._replace(report=report)
-        known, around = near(memory.known, place, self.neighbours, jnp.inf)
-        there = around.who < self.count
         index = jnp.minimum(around.who, self.count - 1)
-        gap = jnp.sqrt(jnp.sum((body[:, None] - body[index]) ** 2, axis=2)) - radius[:, None] - radius[index]
-        gap = jnp.where(there, gap, jnp.inf)
+        gap = jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index]
+        gap = jnp.where(around.who < self.count, gap, jnp.inf)
         touching = gap < 0.0
-        if len(memory.touched):
-            rows = jnp.broadcast_to(jnp.arange(self.count, dtype=index.dtype)[:, None], index.shape)
-            touched = memory.touched.at[jnp.minimum(rows, index), jnp.maximum(rows, index)].max(touching)
-            contacts = jnp.where(jnp.any(touching), jnp.sum(touched), report.contacts)
-        else:
-            touched, contacts = memory.touched, report.contacts + jnp.sum(touching) // 2
-        report = report._replace(smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap)), contacts=contacts)
-        return memory._replace(touched=touched, known=known, report=report)
+        rows = jnp.broadcast_to(jnp.arange(self.count, dtype=index.dtype)[:, None], index.shape)
+
+        def counted(before: tuple[Array, Array]) -> tuple[Array, Array]:
+            if not len(memory.touched):
+                return before[0], before[1] + jnp.sum(touching) // 2
+            touched = before[0].at[jnp.minimum(rows, index), jnp.maximum(rows, index)].max(touching)
+            return touched, jnp.sum(touched)
+
+        touched, contacts = jax.lax.cond(jnp.any(touching), counted, lambda before: before, (memory.touched, report.contacts))
+        smallest = jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf))
+        return memory._replace(touched=touched, report=report._replace(smallest_distance=smallest, contacts=contacts))
 
 
 @float64

@@ -12,7 +12,6 @@ conditions and its proof are in docs/robots.md.
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from consat.numerics import add_up
-from consat.robots.model import Model, along, shortened
+from consat.robots.model import Model, along, dot, shortened, squared
 from consat.robots.neighbours import Near
 from consat.robots.obstacles import Map
 
@@ -102,11 +101,11 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
     if stop is not None:
         own, other = _closest(own, stop[:, None] - own, other, stop[index] - other)
     apart = own - other
-    distance = jnp.sqrt(_squared(apart))
+    distance = jnp.sqrt(squared(apart))
     normals = apart / jnp.where(distance > 0.0, distance, 1.0)[..., None]
     gap = distance - size[:, None] - size[index]
-    least = jnp.sum(normals * own, axis=2) - 0.5 * share * gap
-    length = jnp.zeros_like(size) if stop is None else jnp.sqrt(_squared(stop - place))
+    least = dot(normals, own) - 0.5 * share * gap
+    length = jnp.zeros_like(size) if stop is None else jnp.sqrt(squared(stop - place))
     beyond = near.beyond - length - jnp.max(length, initial=0.0) - size - jnp.max(size, initial=0.0)
     return Planes(normals, jnp.where(there, least, VOID), jnp.maximum(0.5 * share * beyond, 0.0))
 
@@ -114,16 +113,16 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
 def obstacle_planes(place: Array, stop: Array | None, size: Array, obstacles: Map, seen: int, share: float = 1.0) -> Planes:
     """The planes between robots and the `seen` convex parts of obstacles that are nearest; arguments as for `neighbour_planes`."""
     distance = obstacles.distances(place) - size[:, None]
-    length = jnp.zeros_like(size) if stop is None else jnp.sqrt(_squared(stop - place))
+    length = jnp.zeros_like(size) if stop is None else jnp.sqrt(squared(stop - place))
     count = distance.shape[1]
     seen = min(seen, count)
     index = jnp.argsort(distance, axis=1)
     beyond = jnp.take_along_axis(distance, index[:, seen : seen + 1], axis=1)[:, 0] if count > seen else jnp.full_like(size, jnp.inf)
     own, other = obstacles.closest(place, place if stop is None else stop, index[:, :seen])
     apart = own - other
-    gap = jnp.sqrt(_squared(apart))
+    gap = jnp.sqrt(squared(apart))
     normals = apart / jnp.where(gap > 0.0, gap, 1.0)[..., None]
-    least = jnp.sum(normals * own, axis=2) - share * (gap - size[:, None])
+    least = dot(normals, own) - share * (gap - size[:, None])
     return Planes(normals, least, jnp.maximum(share * (beyond - length), 0.0))
 
 
@@ -142,14 +141,6 @@ def margin(model: Model[Any], count: int, dt: float, noise: float, share: float 
     return HAIR + noise * (1.0 + np.sqrt(2.0) * pace.max() * dt / (share * size.min()))
 
 
-def _squared(vectors: Array) -> Array:
-    return functools.reduce(jnp.add, [vectors[..., axis] ** 2 for axis in range(vectors.shape[-1])])
-
-
-def _dot(first: Array, second: Array) -> Array:
-    return functools.reduce(jnp.add, [first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
-
-
 def _divisor(value: Array) -> Array:
     return jnp.where(value > TINY, value, 1.0)
 
@@ -157,8 +148,8 @@ def _divisor(value: Array) -> Array:
 def _closest(own: Array, along_own: Array, other: Array, along_other: Array) -> tuple[Array, Array]:
     """The closest points of two segments, each a start and a vector to its end, (…, d); Ericson, Real-Time Collision Detection, 5.1.9."""
     apart = own - other
-    a, e, f = _squared(along_own), _squared(along_other), _dot(along_other, apart)
-    b, c = _dot(along_own, along_other), _dot(along_own, apart)
+    a, e, f = squared(along_own), squared(along_other), dot(along_other, apart)
+    b, c = dot(along_own, along_other), dot(along_own, apart)
     a, e = jnp.broadcast_to(a, b.shape), jnp.broadcast_to(e, b.shape)
     across = a * e - b * b
     s = jnp.where(across > TINY * a * e, jnp.clip((b * f - c * e) / _divisor(across), 0.0, 1.0), 0.0)

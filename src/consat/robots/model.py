@@ -86,7 +86,7 @@ class Model(Protocol, Generic[S]):
         air, (N, d), or None where there is none."""
 
     def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
-        """(N, k) the least n·x, for k unit vectors (N, k, d) of each robot, that `place` comes to after this moment: within the step, at its
+        """(N, k) the least n·x, for k unit vectors (N, k, d) of each robot, that `place` comes to after this moment: in the step, at its
         end, or in the halt that may follow. Without wind."""
 
     def rows(self, state: S, normals: Array, least: Array, dt: float) -> Array:
@@ -119,6 +119,16 @@ def shortened(vectors: Array, limit: Array) -> Array:
 def along(normals: Array, points: Array) -> Array:
     """(N, k) n·x for k vectors (N, k, d) and one point (N, d) of each robot."""
     return functools.reduce(operator.add, [normals[:, :, axis] * points[:, axis][:, None] for axis in range(points.shape[1])])
+
+
+def squared(vectors: Array) -> Array:
+    """(…, d) → (…) ‖x‖²."""
+    return dot(vectors, vectors)
+
+
+def dot(first: Array, second: Array) -> Array:
+    """(…, d) → (…)."""
+    return functools.reduce(operator.add, [first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
 
 
 def checked(model: Any) -> None:

@@ -42,7 +42,7 @@ def candidates(place: Array) -> Candidates:
     rows = jnp.arange(count, dtype=jnp.int32)
     squared = jnp.where(rows[:, None] == rows[None], jnp.float32(jnp.inf), squared)
     listed = min(LISTED, count - 1)
-    least, index = jax.lax.top_k(-squared, min(listed + 1, count))
+    least, index = _largest(-squared, min(listed + 1, count))
     found = jnp.sqrt(-least[:, -1]).astype(place.dtype) * ROUNDED
     return Candidates(index[:, :listed].astype(jnp.int32), place, found)
 
@@ -72,8 +72,14 @@ def _near(known: Candidates, place: Array, seen: int) -> tuple[Array, Array, Arr
     squared = add_up([(place[:, axis][:, None] - others[..., axis]) ** 2 for axis in range(place.shape[1])])
     count = known.who.shape[1]
     seen = min(seen, count)
-    least, order = jax.lax.top_k(-squared.astype(jnp.float32), min(seen + 1, count))
+    least, order = _largest(-squared.astype(jnp.float32), min(seen + 1, count))
     distance = jnp.sqrt(-least).astype(place.dtype)
     index = jnp.take_along_axis(known.who, order[:, :seen], axis=1)
     next_ = distance[:, seen] * ROUNDED if count > seen else jnp.full(len(place), jnp.inf)
     return distance[:, :seen], index, jnp.minimum(next_, unlisted), next_ <= unlisted
+
+
+def _largest(rows: Array, count: int) -> tuple[Array, Array]:
+    """The largest of each row and where they are. Without the barrier XLA turns it, and the slices that follow, into a sort of whole rows."""
+    values, index = jax.lax.optimization_barrier(tuple(jax.lax.top_k(rows, count)))
+    return values, index

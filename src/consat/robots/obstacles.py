@@ -19,6 +19,7 @@ import shapely
 from jax import Array
 
 from consat.errors import Fault, InvalidInput, shown
+from consat.numerics import float64
 
 HALVINGS = 40
 """To find the point of a robot's segment that is nearest to a part: down to 1e-12 of the segment."""
@@ -327,6 +328,7 @@ def _off(distance: float) -> str:
     return f"{distance:.4g} m" if distance > 0.0 else "inside one"
 
 
+@float64
 def start_faults(names: Sequence[str], starts: np.ndarray, size: np.ndarray, obstacles: Map) -> list[Fault]:
     """What is wrong with starts (N, d) of bodies of these sizes (N,): within an obstacle, or on top of each other."""
     from scipy.spatial import cKDTree
