@@ -10,7 +10,7 @@ import h5netcdf
 import h5py
 import numpy as np
 
-SCHEMA = "consat.results.result/1"
+SCHEMA = "consat.result/1"
 AXES = ("x", "y", "z")
 VARIABLES: Mapping[str, tuple[tuple[str, ...], Mapping[str, str]]] = {
     "position": (("agent", "axis"), {"units": "length", "long_name": "own position x_i"}),
