@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from consat.problem.schedule import Schedule, schedule
     from consat.problem.team import Agent, Team
     from consat.results.result import Result
+    from consat.robots import Double, Point, Quadrotor, Unicycle, disc, polygon
     from consat.runs.runner import resume, run
     from consat.runs.session import Session
     from consat.runs.solving import solve
@@ -33,6 +34,7 @@ _HOME = {
     ),
     "problem.objective": ("margins",),
     "results.result": ("Result",),
+    "robots": ("Double", "Point", "Quadrotor", "Unicycle", "disc", "polygon"),
     "runs.runner": ("resume", "run"),
     "runs.session": ("Session",),
     "runs.solving": ("solve",),
@@ -47,10 +49,10 @@ forks.watch()
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Agent", "ConsatError", "Constraint", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
-    "InvalidSettings", "InvalidTeam", "Ramp", "Result", "Scenario", "Schedule", "Session", "Settings", "Smoothing", "Sweep", "Team",
-    "apart", "box", "constraint", "displacement", "dump", "each", "expr", "halfspace", "load", "loads", "margins", "near", "outside",
-    "resume", "run", "schedule", "solve", "sweep", "within",
+    "Agent", "ConsatError", "Constraint", "Double", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
+    "InvalidSettings", "InvalidTeam", "Point", "Quadrotor", "Ramp", "Result", "Scenario", "Schedule", "Session", "Settings", "Smoothing",
+    "Sweep", "Team", "Unicycle", "apart", "box", "constraint", "disc", "displacement", "dump", "each", "expr", "halfspace", "load",
+    "loads", "margins", "near", "outside", "polygon", "resume", "run", "schedule", "solve", "sweep", "within",
 ]  # fmt: skip
 
 

@@ -230,7 +230,7 @@ def test_own_constraints_change_too() -> None:
     assert session.satisfied
     session.change("a", "own", scale=-1.0).step(1)  # it bends the other way: not concave any more
     np.testing.assert_allclose(session.margins, [1.0 + np.sum((session.positions[0] - [3.0, 0.0]) ** 2)])
-    with pytest.raises(cs.InvalidTeam, match="there is no parameter 'sale'.*did you mean 'scale'"):
+    with pytest.raises(cs.InvalidTeam, match=r"there is no parameter 'sale'.*did you mean 'scale'"):
         session.change("a", "own", sale=2.0)
 
 
@@ -252,7 +252,7 @@ def test_a_box_is_changed_as_a_whole() -> None:
     session = cs.Session(cs.Team([cs.Agent("a", [cs.box([0, 0], [1, 1]), cs.within([0, 0], 9)], start=[5, 5])])).step(20)
     session.change("a", "box", low=[2, 2], high=[3, 3]).step(30)
     assert np.all((session.positions[0] > 2) & (session.positions[0] < 3))
-    with pytest.raises(cs.InvalidTeam, match="high is .* but must be above low"):
+    with pytest.raises(cs.InvalidTeam, match=r"high is .* but must be above low"):
         session.change("a", "box", low=[4, 4])
     with pytest.raises(cs.InvalidSettings, match="rounds is -1"):
         session.step(-1)

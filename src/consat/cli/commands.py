@@ -103,6 +103,13 @@ def init(name: str | None) -> None:
     click.echo(f"{target} written; now: consat run {target}", err=True)
 
 
+def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
+    try:
+        return tuple(float(each) for each in value.split(",")) if value else ()
+    except ValueError:
+        raise click.BadParameter(f"{value!r} must be numbers, such as 0.1,0 for wind along x") from None
+
+
 def _names(context: click.Context, parameter: click.Parameter, value: str | None) -> Any:
     return value if value in (None, "all", "none") else [name.strip() for name in str(value).split(",")]
 
@@ -116,12 +123,22 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
 @click.option("--rounds", type=click.IntRange(min=0), help="How many rounds; implies --stop never.")
-@click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End of a flow; implies --stop never.")
+@click.option(
+    "--until",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End of the run; implies --stop never. In rounds with --rate.",
+)
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end earlier.")
 @click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
 @click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that an agent skips a round.")
-@click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, for bodies that cannot jump.")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, where rounds take time.")
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
+@click.option(
+    "--robots", type=click.Choice(["point", "double", "unicycle", "quadrotor"]), help="What bodies are; by default the scenario's."
+)
+@click.option("--wind", callback=_numbers, metavar="VX,VY", help="Velocity of the air, m/s, for robots.")
+@click.option("--noise", type=click.FloatRange(min=0), default=0.0, metavar="M", help="What a robot's position is measured wrong by, m.")
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @out_option
 @force_option

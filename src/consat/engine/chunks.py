@@ -15,6 +15,7 @@ from jax import Array
 from consat.engine.recording import Choice
 from consat.engine.round import SATISFIED, Now, Seen, World, begin, one_round, see
 from consat.engine.violations import violated
+from consat.engine.ways import Ways
 from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
 
@@ -37,11 +38,13 @@ class Kept(NamedTuple):
         position: (R, d).
         agent_margin: (R,).
         estimate: (E, d), of no copies where none are recorded.
+        heading: (R,) rad; (0,) where bodies have none.
     """
 
     position: Any
     agent_margin: Any
     estimate: Any
+    heading: Any
 
 
 class Chunk(NamedTuple):
@@ -133,7 +136,8 @@ class Chosen:
 
     def of_seen(self, seen: Seen) -> Kept:
         position, margin = (values if self.agents is None else values[self.agents] for values in (seen.position, seen.agent_margin))
-        return Kept(position, margin, seen.estimate[self.copies])
+        heading = seen.heading if self.agents is None or not len(seen.heading) else seen.heading[self.agents]
+        return Kept(position, margin, seen.estimate[self.copies], heading)
 
 
 class _Loop(NamedTuple):
@@ -192,6 +196,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
             jnp.zeros((capacity, recorded, d), real),
             jnp.zeros((capacity, recorded), real),
             jnp.zeros((capacity, len(chosen.copies), d), real),
+            jnp.zeros((capacity, recorded if now.robots is not None else 0), real),
         ),
     )
 
@@ -232,7 +237,7 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
 
 def _look(world: World, chosen: Chosen, now: Now, number: Array) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world.at(number), now.state.x, now.body, (nothing, nothing), (nothing, nothing)))
+    return chosen.of_seen(see(world.at(number), now, (nothing, nothing), (nothing, nothing)))
 
 
 @functools.cache
@@ -266,12 +271,16 @@ class OneProcess:
         self._large = world.everyone.agents > LARGE
         self._protocol, self.world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
+        self._ways = None if world.drive is None or not world.drive.map.count else Ways(world.drive)
 
     def start(self) -> tuple[Now, Chunk]:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)
         return _compiled(self._large)[0](self._protocol, self.world, self._chosen, first, key)
 
     def advance(self, state: Now, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[Now, Chunk]:
+        if self._ways is not None and state.robots is not None:
+            targets = np.asarray(state.state.x)[np.asarray(self.world.own)]
+            state = state._replace(robots=self._ways.planned(state.robots, np.asarray(state.body), targets))
         hold, most = (NEVER, NEVER) if self._hold is None or streak is None else self._hold
         knowing = 0 if streak is None else self._knowing
         satisfied, near = streak or (0, 0)

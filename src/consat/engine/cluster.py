@@ -169,7 +169,7 @@ class ManyProcesses:
             floats=floats.sum(axis=0).astype(np.int64),
             drift=drift[:, :count].max(),
             violated=None,
-            kept=Kept(people[..., :d], people[..., d], rows),
+            kept=Kept(people[..., :d], people[..., d], rows, np.zeros((len(people), 0))),
         )
 
     def positions(self, state: _State) -> np.ndarray:

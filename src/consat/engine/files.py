@@ -91,9 +91,9 @@ class Files:
         """What the run that is taken up said of itself."""
         return {} if self.taken_up is None else self.taken_up[1]
 
-    def sink(self, team: Team, copies: Estimates, choice: Choice, clock: str) -> Log:
-        """The record; `clock` is ``time`` or ``round``."""
-        names = variables(self._labels(team, copies, choice), integral=clock == "time", bound=clock == "round")
+    def sink(self, team: Team, copies: Estimates, choice: Choice, clock: str, *, heading: bool = False) -> Log:
+        """The record; `clock` is ``time`` or ``round``; heading: whether bodies have one."""
+        names = variables(self._labels(team, copies, choice), integral=clock == "time", bound=clock == "round", heading=heading)
         sizes = {"agent": len(choice.agents), "axis": team.dimension, "copy": 0 if choice.copies is None else len(choice.copies)}
         shapes = {name: tuple(sizes[along] for along in VARIABLES[name][0]) for name in names if clock == "time" or name != "velocity"}
         path = self.directory / LOG
@@ -120,8 +120,9 @@ class Files:
         copies = None if trace.estimate is None else (trace.holder, trace.held)
         named = labels(team.ids, trace.recorded, trace.cluster, copies)
         write(
-            path, trace.clock, variables(named, integral=trace.integral is not None, bound=trace.bound is not None), named, team.dimension,
-            count=log.count, steps=log.steps(1.0 if trace.period is None else trace.period),
+            path, trace.clock,
+            variables(named, integral=trace.integral is not None, bound=trace.bound is not None, heading=trace.heading is not None),
+            named, team.dimension, count=log.count, steps=log.steps(1.0 if trace.period is None else trace.period),
             attributes=attributes(summary, scenario), final=None if trace.recorded is None else trace.end,
         )  # fmt: skip
         if self.seconds is None and self.taken_up is None:

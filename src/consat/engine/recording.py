@@ -45,6 +45,7 @@ class Rows(NamedTuple):
         estimate: (K, E, d), or None.
         integral: (K, E, d), or None.
         bound: (K,) on the best margin, proven by all agents, NaN where none is; None in continuous time.
+        heading: (K, R) rad; None where bodies have none.
     """
 
     step: Any
@@ -56,6 +57,7 @@ class Rows(NamedTuple):
     estimate: Any
     integral: Any
     bound: Any = None
+    heading: Any = None
 
     def where(self, chosen: np.ndarray) -> Rows:
         """Some of the steps."""

@@ -24,7 +24,10 @@ from consat.protocols.interior_point import EXACTLY, near
 from consat.protocols.local import proximal as prox
 from consat.protocols.local.interior import Interior
 from consat.protocols.solver import EXACT, LocalSolver
+from consat.robots.drive import Drive
 
+PATH = 8
+"""Waypoints of a path, of which few have so many; where one has more, rounds are compiled once more."""
 QUICK = prox.Precision(tolerance=None)
 """Of every local step of a large team: there the arithmetic counts, and an exact step saves no rounds. Each begins where the last ended, so
 that the steps become exact as the team comes to rest."""
@@ -123,20 +126,29 @@ class Body:
     Attributes:
         rate: rounds a second, Hz.
         speed: the most that a body moves, length/s; if infinite it is where its agent wants to be.
+        drive: the robots that bodies are; None for bodies that move as they are told.
+        wind: (d,) velocity of the air, m/s.
+        noise: the most that a measured position is wrong by, m.
     """
 
     rate: float
     speed: float = np.inf
+    drive: Drive | None = None
+    wind: tuple[float, ...] = ()
+    noise: float = 0.0
 
     @property
     def reach(self) -> float | None:
         """The most that it moves in a round; None without limit."""
+        if self.drive is not None:
+            return float(np.max(np.asarray(self.drive.model.pace(self.drive.count)))) / self.rate
         return self.speed / self.rate if np.isfinite(self.speed) else None
 
 
 class Seen(NamedTuple):
     """What an observer of the whole team sees after each round; leading axis T."""
 
+    heading: Any
     position: Any
     margin: Any
     smooth_margin: Any
@@ -187,6 +199,9 @@ class World:
         rough: whether messages can be lost or agents sleep.
         part: of which larger team this is a part; None of none.
         live: what may change of the constraints; None where nothing does.
+        drive: the robots that bodies are; None of none.
+        wind: (d,) velocity of the air, m/s; None where it is still.
+        noise: the most that a measured position is wrong by, m; None where they are exact.
     """
 
     everyone: Everyone
@@ -202,6 +217,9 @@ class World:
     rough: bool = field(metadata={"static": True})
     part: Part | None = None
     live: Live | None = None
+    wind: Array | None = None
+    noise: Array | None = None
+    drive: Drive | None = field(default=None, metadata={"static": True})
 
     def at(self, round_: Array) -> World:
         """With the constraints as they are after so many rounds."""
@@ -218,6 +236,20 @@ class World:
         return replace(self, everyone=everyone, observer=self.observer.with_parameters(values))
 
 
+class Driven(NamedTuple):
+    """What robots are in, and carry on.
+
+    Attributes:
+        state: of the models.
+        memory: of `consat.robots.drive`.
+        paths: (N, W, d) the ways that they have planned; None where nothing is in the way.
+    """
+
+    state: Any
+    memory: Any
+    paths: Array | None
+
+
 class Now(NamedTuple):
     """Everything a round changes: what the agents remember, where their bodies are, and the key of what goes wrong.
 
@@ -227,6 +259,7 @@ class Now(NamedTuple):
         body: (N, d).
         key: of the random draws.
         heard: what they know of each other's bodies; None where bodies can jump.
+        robots: what bodies are; None where they are points.
     """
 
     state: Any
@@ -234,6 +267,7 @@ class Now(NamedTuple):
     body: Array
     key: Array
     heard: agreement.Bodies | None = None
+    robots: Driven | None = None
 
 
 class Spoken(NamedTuple):
@@ -250,6 +284,7 @@ class Spoken(NamedTuple):
         key: of the random draws that follow.
         messages: sent.
         floats: sent.
+        robots: likewise.
     """
 
     state: Any
@@ -262,13 +297,14 @@ class Spoken(NamedTuple):
     key: Array
     messages: Array
     floats: Array
+    robots: Driven | None = None
 
 
 def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
     """What all agents do in one round."""
     spoken = speak(protocol, world, now, round_)
     now, known = hear(protocol, world, spoken)
-    return now, see(world, now.state.x, now.body, known, (spoken.messages, spoken.floats))
+    return now, see(world, now, known, (spoken.messages, spoken.floats))
 
 
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
@@ -291,7 +327,12 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     if counted is not None:
         sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
         copies_sent = jnp.sum(counted)
-    body = _moved(now.body, pick(state.x, world.own), world.reach)
+    targets = pick(state.x, world.own)
+    if now.robots is None or world.drive is None:
+        body, robots = _moved(now.body, targets, world.reach), None
+    else:
+        robots = _driven(world, world.drive, now.robots, targets, jax.random.fold_in(now.key, round_.astype(jnp.int32)))
+        body = world.drive.model.place(robots.state)
     heard, word = now.heard, None
     if now.heard is not None and world.owners is not None:
         heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
@@ -303,7 +344,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
         reached = talks if reached is None else talks & reached
         floats += jnp.sum(jnp.where(talks, everyone.interior.plan.floats, 0))
-    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats)
+    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats, robots)
 
 
 _AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
@@ -337,7 +378,7 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Arr
     if heard is not None and word is not None and world.owners is not None:
         heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
     known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
-    now = Now(state, ages, spoken.body, spoken.key, heard)
+    now = Now(state, ages, spoken.body, spoken.key, heard, spoken.robots)
     return now, knowledge(protocol, world, now, known if world.part is None else known | ~world.part.ours)
 
 
@@ -375,11 +416,29 @@ def _moved(body: Array, target: Array, reach: Array | None) -> Array:
     return jnp.where(distance > reach, body + away * (reach / jnp.where(distance > 0, distance, 1.0)), target)
 
 
-def see(world: World, x: Array, body: Array, known: tuple[Array, Array], sent: tuple[Array, Array]) -> Seen:
-    """What an observer sees of estimates x and positions `body`; known: see `knowledge`; sent: messages and floats."""
-    margins = world.observer.agent_margins(body)
-    smooth = world.observer.smooth_margin(body, world.everyone.nu)
-    return Seen(body, jnp.min(margins), smooth, margins, x, *known, *sent)
+def _driven(world: World, drive: Drive, robots: Driven, targets: Array, key: Array) -> Driven:
+    """Where robots are after they have driven towards their targets, (N, d), for a round; key: of what is measured wrong."""
+    measured = None
+    if world.noise is not None:
+        direction = jax.random.normal(key, targets.shape)
+        size = world.noise * jax.random.uniform(jax.random.fold_in(key, 1), (len(targets), 1))
+        measured = drive.model.place(robots.state) + size * direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
+    wind = None if world.wind is None else jnp.broadcast_to(world.wind[None], targets.shape)
+    paths = robots.paths
+    if paths is not None:  # a way ends where the target is now
+        end = jnp.all(paths == paths[:, -1:], axis=2, keepdims=True)
+        paths = jnp.where(end, targets[:, None], paths)
+    state, memory, _ = drive.step(robots.state, robots.memory, targets, paths=paths, measured=measured, wind=wind)
+    return Driven(state, memory, robots.paths)
+
+
+def see(world: World, now: Now, known: tuple[Array, Array], sent: tuple[Array, Array]) -> Seen:
+    """What an observer sees; known: see `knowledge`; sent: messages and floats."""
+    margins = world.observer.agent_margins(now.body)
+    smooth = world.observer.smooth_margin(now.body, world.everyone.nu)
+    turns = now.robots is not None and world.drive is not None
+    heading = world.drive.model.heading(now.robots.state) if turns else jnp.zeros(0)  # type: ignore[union-attr]
+    return Seen(heading, now.body, jnp.min(margins), smooth, margins, now.state.x, *known, *sent)
 
 
 def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, old: Any) -> Any:
@@ -412,8 +471,13 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
     """The start from first estimates, (C, d), and what is seen of it."""
     start = first[world.own]
     heard = None if world.owners is None else agreement.start_bodies(first, world.everyone)
-    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard)
-    return now, see(world, first, start, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
+    robots = None
+    if world.drive is not None:
+        state = world.drive.model.start(start)
+        paths = jnp.repeat(start[:, None], PATH, axis=1) if world.drive.map.count else None
+        robots = Driven(state, world.drive.start(state), paths)
+    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard, robots)
+    return now, see(world, now, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
 
 
 def precision_for(count: int) -> prox.Precision:
@@ -473,6 +537,9 @@ def world_of(
         pairs=len(pairs),
         rough=rough,
         live=live,
+        wind=jnp.asarray(body.wind, dtype=float) if body is not None and any(body.wind) else None,
+        noise=jnp.asarray(body.noise) if body is not None and body.noise > 0 else None,
+        drive=None if body is None else body.drive,
     )
 
 

@@ -16,7 +16,7 @@ from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
 from consat.engine.live import Live
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
-from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Weather, World, world_of
+from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Now, Weather, World, world_of
 from consat.engine.violations import shares
 from consat.numerics import float64
 from consat.problem.objective import Nu
@@ -274,6 +274,7 @@ class _Course:
 
     def start(self) -> tuple[Any, Rows]:
         state, chunk = self._engine.start()
+        self._last = state
         return state, self._count(chunk, 1)
 
     def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
@@ -282,6 +283,7 @@ class _Course:
         streak = (self.tally.streak, self.tally.near) if done >= least else None
         count = min(CHUNK, (least if done < least else self.end) - done)
         state, chunk = self._engine.advance(state, done, count, streak, every)
+        self._last = state
         rows = self._count(chunk, every)
         return state, rows, self._rules.ending(self.tally, functools.partial(self.positions, state))
 
@@ -300,7 +302,8 @@ class _Course:
     def _rows(self, step: np.ndarray, margins: Sequence[np.ndarray], kept: Kept) -> Rows:
         margin, smooth_margin, bound = margins
         estimate = None if self._choice.copies is None else kept.estimate
-        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound)
+        heading = kept.heading if self._engine.world.drive is not None else None
+        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound, heading)
 
     def told(self, rows: Rows) -> Mapping[str, Any]:
         tally = self.tally
@@ -312,7 +315,8 @@ class _Course:
             "floats_sent": tally.floats,
             **_known(tally),
             "period": self._period,
-            "motion": None if self._period is None else tally.motion(self._period),
+            "heading": rows.heading,
+            "motion": None if self._period is None else tally.motion(self._period) | driven(self._team, self._engine.world, self._last),
             "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
         }
 
@@ -320,6 +324,22 @@ class _Course:
 def known_of(tally: Tally) -> Literal["satisfied", "infeasible"] | None:
     """What all agents know."""
     return "satisfied" if tally.known & SATISFIED else "infeasible" if tally.known & INFEASIBLE else None
+
+
+def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
+    """Of ``run --json`` what is said of robots: distances, m, contacts, and who is stuck."""
+    if world.drive is None or now.robots is None:
+        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": []}
+    drive, robots = world.drive, now.robots
+    report = drive.observed(robots.state, robots.memory).report
+    gap, clear = float(report.smallest_distance), float(report.clearance)
+    stuck = drive.stuck(robots.state, robots.memory, now.state.x[world.own])
+    return {
+        "smallest_distance": gap if np.isfinite(gap) else None,
+        "clearance": clear if np.isfinite(clear) else None,
+        "contacts": int(report.contacts),
+        "stuck": [team.ids[i] for i in stuck],
+    }
 
 
 def _known(tally: Tally) -> Mapping[str, Any]:

@@ -19,6 +19,7 @@ VARIABLES: Mapping[str, tuple[tuple[str, ...], Mapping[str, str]]] = {
     "smooth_margin": ((), {"long_name": "smooth margin β"}),
     "bound": ((), {"long_name": "bound on the best margin, proven by all agents"}),
     "agent_margin": (("agent",), {"long_name": "agent margin ᾱ_i"}),
+    "heading": (("agent",), {"units": "rad", "long_name": "heading of the body"}),
     "estimate": (("copy", "axis"), {"long_name": "estimate x_j^(i)"}),
     "integral": (("copy", "axis"), {"long_name": "integral state z_i"}),
 }

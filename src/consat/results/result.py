@@ -164,9 +164,9 @@ def labels(
     return found
 
 
-def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool) -> list[str]:
+def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool, heading: bool) -> list[str]:
     """What is recorded, of people with these `labels`."""
-    of_agents = ["position", "velocity", "agent_margin"] if "agent" in named else []
+    of_agents = ["position", "velocity", "agent_margin", *(["heading"] if heading else [])] if "agent" in named else []
     of_copies = ["estimate", *(["integral"] if integral else [])] if "holder" in named else []
     return ["margin", "smooth_margin", *(["bound"] if bound else []), *of_agents, *of_copies]
 
@@ -188,7 +188,9 @@ def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str 
     data = xr.Dataset(
         {
             name: ((clock, *VARIABLES[name][0]), getattr(trace, name), VARIABLES[name][1])
-            for name in variables(named, integral=trace.integral is not None, bound=trace.bound is not None)
+            for name in variables(
+                named, integral=trace.integral is not None, bound=trace.bound is not None, heading=trace.heading is not None
+            )
         },
         coords={
             clock: (clock, trace.steps, {"units": UNITS[clock]}),

@@ -44,6 +44,7 @@ class Trace:
         violated: (M,) share of all steps, the start among them, at which each constraint was violated; NaN for those that are not watched,
             see `consat.engine.violations`; None where nobody counted.
         motion: what is said of a team that moves, see ``run --json``; None in continuous time, and where rounds take no time.
+        heading: (T, N) of bodies, rad; None where they have none.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -73,6 +74,7 @@ class Trace:
     file: Path | None = None
     bound: np.ndarray | None = None
     motion: Mapping[str, Any] | None = None
+    heading: np.ndarray | None = None
 
     @property
     def end(self) -> np.ndarray:

@@ -16,10 +16,12 @@ from consat.engine.round import Body, Weather
 from consat.errors import InvalidSettings
 from consat.problem.team import Team
 from consat.protocols.estimates import Layout
+from consat.robots import Drive
+from consat.robots.description import Robots
 from consat.settings import Smoothing
 
 RATE = 20.0
-"""Rounds a second, Hz, where constraints move with time and nobody says."""
+"""Rounds a second, Hz, where constraints move with time, or robots drive, and nobody says."""
 WATCHED = 60.0
 """s; how long a team is followed whose constraints read the time, when nobody says."""
 
@@ -58,17 +60,25 @@ class Options:
     record: bool | None = None
     agents: Who = None
     every: int = 1
+    robots: Robots | None = None
+    wind: tuple[float, ...] = ()
+    noise: float = 0.0
 
     @property
     def data(self) -> dict[str, Any]:
         """As JSON can hold them."""
-        return {field.name: _as_data(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        robots = None if self.robots is None else self.robots.data
+        return {field.name: _as_data(getattr(self, field.name)) for field in dataclasses.fields(self)} | {"robots": robots}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
         """From `data`."""
-        smoothing = data["smoothing"]
-        return cls(**{**data, "smoothing": smoothing if smoothing in (None, "auto") else Smoothing.model_validate(smoothing)})
+        smoothing, robots = data["smoothing"], data["robots"]
+        made = {
+            "smoothing": smoothing if smoothing in (None, "auto") else Smoothing.model_validate(smoothing),
+            "robots": None if robots is None else Robots.of(robots),
+        }
+        return cls(**{**data, "wind": tuple(data["wind"]), **made})
 
     def stop_for(self, kind: str) -> Stop:
         """When a run with a protocol ends before the time or the rounds are up."""
@@ -80,7 +90,7 @@ class Options:
 
     def require_flow(self, kind: str, team: Team) -> None:
         """Raises: InvalidSettings: there is something that continuous time does not know."""
-        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "rate", "speed")}
+        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "rate", "speed", "robots", "wind", "noise")}
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
             raise InvalidSettings(message)
@@ -93,12 +103,28 @@ class Options:
             raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
         return Weather(self.loss, self.sleep, seed)
 
+    def _driven(self, team: Team, rate: float) -> dict[str, Any]:
+        """What robots add to a body."""
+        if self.robots is None:
+            return {}
+        if self.speed is not None:
+            raise InvalidSettings("speed is of bodies that are points; robots have a speed of their own, robots: {speed: ..}")
+        if len(self.wind) not in (0, team.dimension) or not all(map(math.isfinite, self.wind)):
+            raise InvalidSettings(f"wind is {list(self.wind)}, but must be {team.dimension} numbers, m/s")
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise InvalidSettings(f"noise is {self.noise}, but must be a length from 0, m")
+        model = self.robots.fleet(list(team.ids))
+        drive = Drive(model, team.count, team.dimension, 1.0 / rate, self.robots.obstacles, noise=self.noise)
+        return {"drive": drive, "wind": self.wind, "noise": self.noise}
+
     def pace(self, kind: str, team: Team) -> Pace:
         """How rounds follow one another. Raises: InvalidSettings: what is said of it does not fit together."""
-        rate = RATE if self.rate is None and team.moves else self.rate
+        rate = RATE if self.rate is None and (team.moves or self.robots is not None) else self.rate
+        if self.robots is None and (self.wind or self.noise):
+            raise InvalidSettings("wind and noise mean something to robots only; give robots, too")
         if (self.speed is not None and rate is None) or not all(value is None or value > 0 for value in (self.speed, rate)):
             raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
-        body = None if rate is None else Body(rate, np.inf if self.speed is None else self.speed)
+        body = None if rate is None else Body(rate, np.inf if self.speed is None else self.speed, **self._driven(team, rate))
         if self.until is None:
             knots = team.knots
             horizon = float(knots.max()) if len(knots) else WATCHED

@@ -12,13 +12,14 @@ import numpy as np
 
 from consat.certify.certificate import bounds
 from consat.certify.quadratics import shape_of
-from consat.errors import InvalidInput, InvalidSettings, counted
+from consat.errors import InvalidInput, InvalidSettings, InvalidTeam, counted
 from consat.problem.objective import Schedule
 from consat.problem.team import Team
 from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
 from consat.protocols.estimates import Estimates, Layout
 from consat.protocols.local.interior import Way, route_of
+from consat.robots import Drive, start_faults
 from consat.runs.options import Options
 from consat.scenario import Scenario, dump, load
 from consat.settings import ProtocolSettings, Settings, Start
@@ -137,9 +138,10 @@ class Prepared(NamedTuple):
         schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
         return cls(team, copies_of(team, settings.protocol), schedule, size, settings)
 
-    def first(self, start: Start | None = None) -> np.ndarray:
-        """(C, d) first estimates, drawn as the settings say, or otherwise."""
-        return first_estimates(self.team, self.copies, start or self.settings.start, self.size)
+    def first(self, start: Start | None = None, drive: Drive | None = None) -> np.ndarray:
+        """(C, d) first estimates, drawn as the settings say, or otherwise; drive: robots, which do not start on top of one another."""
+        first = first_estimates(self.team, self.copies, start or self.settings.start, self.size)
+        return first if drive is None else apart_from_all(self.team, self.copies, first, drive, (start or self.settings.start).seed)
 
     @property
     def convex(self) -> bool:
@@ -163,6 +165,36 @@ class Prepared(NamedTuple):
             if self.settings.protocol.kind == "max-min"
             else None
         )
+
+
+TURNS = 2000
+"""So often a start is drawn anew before it is said that there is no room."""
+
+
+def apart_from_all(team: Team, copies: Estimates, first: np.ndarray, drive: Drive, seed: int) -> np.ndarray:
+    """First estimates, (C, d), in which robots whose start nobody gave do not overlap others or obstacles.
+
+    Raises:
+        InvalidTeam: starts that are given overlap.
+        InvalidSettings: there is no room for all in the box.
+    """
+    random, first = np.random.default_rng([seed, 1]), first.copy()
+    place, size, given = first[copies.own], np.asarray(drive.size), np.isfinite(team.starts).all(axis=1)
+    if found := start_faults(list(team.ids), place[given], size[given], drive.map):
+        raise InvalidTeam(found)
+    low, high = place.min(axis=0) - 4 * size.max(), place.max(axis=0) + 4 * size.max()
+    done = given.copy()
+    for i in np.flatnonzero(~given).tolist():
+        for turn in range(TURNS):
+            free = np.linalg.norm(place[done] - place[i], axis=1) >= size[done] + size[i]
+            if free.all() and float(np.asarray(drive.map.signed_distance(place[i : i + 1]))[0]) >= size[i]:
+                break
+            place[i] = random.uniform(low, high)
+            if turn == TURNS - 1:
+                raise InvalidSettings(f"there is no room for the start of {team.ids[i]!r}; give it one, or a larger start box")
+        done[i] = True
+    first[copies.own] = place
+    return first
 
 
 def _gap(team: Team, position: np.ndarray) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Estimates, Layout
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
+from consat.robots.description import asked
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.summary import summarise
@@ -46,6 +47,10 @@ def run(
     sleep: float = 0.0,
     rate: float | None = None,
     speed: float | None = None,
+    robots: Any = None,
+    obstacles: Sequence[Any] | None = None,
+    wind: Sequence[float] = (),
+    noise: float = 0.0,
     auxiliary: float | None = None,
     record: bool | None = None,
     agents: Who = None,
@@ -72,6 +77,11 @@ def run(
         sleep: probability that an agent skips a round.
         rate: rounds a second, Hz; by default `consat.runs.options.RATE` where constraints move with time, else rounds take no time.
         speed: the most that a body moves, length/s; positions then follow estimates. Without, bodies are where their agents want to be.
+        robots: what bodies are, such as ``consat.Unicycle(radius=0.1)``: a model for all, a mapping from ids to models, or the name of a
+            kind; by default those of the scenario.
+        obstacles: what `consat.disc` and its like return, which robots keep clear of; by default those of the scenario.
+        wind: (d,) velocity of the air, m/s, for robots.
+        noise: the most that a robot's measured position is wrong by, m.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         record: whether to keep all estimates and integral states; by default while they are few.
         agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
@@ -92,11 +102,15 @@ def run(
     """
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
-        loss=loss, sleep=sleep, rate=rate, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
+        loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
+        wind=tuple(map(float, wind)), noise=noise,
     )  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
     scenario = scenario_of(team)
+    options = dataclasses.replace(
+        options, robots=asked(robots, obstacles, scenario.robots, scenario.team.ids), rate=scenario.rate if rate is None else rate
+    )
     if out is not None:
         claim(Path(out), scenario.name, force=force)
     files = None if out is None else Files(Path(out), checkpoint)
@@ -177,7 +191,8 @@ class _Keep:
         choice = Choice.of(team, copies, self.asked.agents, self.asked.record, self.asked.every)
         if self.files is None or jax.process_index() > 0:  # process 0 writes for all
             return {"choice": choice}
-        return {"choice": choice, "sink": self.files.sink(team, copies, choice, clock), "checkpoint": self.files.checkpoints(self.about)}
+        sink = self.files.sink(team, copies, choice, clock, heading=self.asked.robots is not None)
+        return {"choice": choice, "sink": sink, "checkpoint": self.files.checkpoints(self.about)}
 
 
 @float64
@@ -188,6 +203,8 @@ def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simula
     trace = simulate(ready, **options)
     summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
     summary["route"] = told(team, settings.protocol)["route"]
+    machines = keep.asked.robots
+    summary |= {"robots": None, "obstacles": None} if machines is None else {key: machines.data[key] for key in ("robots", "obstacles")}
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
@@ -201,8 +218,9 @@ def _flow(on: Prepared, **options: Any) -> Trace:
 
 
 def _rounds(on: Prepared, **options: Any) -> Trace:
-    asked = on.settings.protocol
+    gains, body = on.settings.protocol, options["body"]
     return simulate_rounds(
-        on.team, with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first(),
+        on.team, with_gains(ROUNDS[str(gains.kind)](), gains), on.copies, on.schedule.final, on.size,
+        on.first(drive=None if body is None else body.drive),
         convex=on.convex, hopeless=on.hopeless, enough=on.enough, **options,
     )  # fmt: skip

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from consat.errors import Fault, InvalidInput, InvalidScenario, closest
 from consat.problem.team import Team
@@ -16,6 +17,9 @@ from consat.scenario.overrides import override
 from consat.scenario.schema import build
 from consat.scenario.writing import write
 from consat.settings import Settings
+
+if TYPE_CHECKING:
+    from consat.robots.description import Robots
 
 _PACKAGE = resources.files("consat.scenario")
 
@@ -31,6 +35,8 @@ class Scenario:
         text: YAML that gives this scenario, overrides included; empty if no text can (own callables).
         source: the file or packaged name it was read from.
         document: where everything stands in it, if it was read.
+        robots: and obstacles; None if agents are points that go where they want.
+        rate: rounds a second, Hz; None if it does not say.
     """
 
     name: str
@@ -39,6 +45,8 @@ class Scenario:
     text: str = field(repr=False)
     source: str
     document: Document | None = field(default=None, repr=False)
+    robots: Robots | None = field(default=None, repr=False)
+    rate: float | None = None
 
 
 def load(source: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scenario:
@@ -70,10 +78,10 @@ def loads(text: str, name: str = "scenario", overrides: Sequence[str] = ()) -> S
     document = read(text, name)
     for each in overrides:
         override(document, each)
-    team, settings, own = build(document)
+    built = build(document)
     if overrides and document.root is not None:
         text = f"# {name!r} with {' '.join(f'--set {each!r}' for each in overrides)}\n{write(document.root.plain)}"
-    return Scenario(own or Path(name).stem, team, settings, text, name, document)
+    return Scenario(built.name or Path(name).stem, built.team, built.settings, text, name, document, built.robots, built.rate)
 
 
 def located(error: InvalidInput, scenario: Scenario) -> InvalidScenario:

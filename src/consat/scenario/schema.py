@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numpy as np
 from pydantic import ValidationError
 
-from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidTeam, closest, counted, shown
+from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidInput, InvalidTeam, closest, counted, shown
 from consat.problem.constraints import KINDS
 from consat.problem.groups import MOST, Each, Group
+from consat.problem.parameters import LARGEST, is_number
 from consat.problem.team import Agent, Links, Team
 from consat.scenario.document import Document, Path
 from consat.scenario.words import complaints, unknown_key
 from consat.settings import Settings
 
+if TYPE_CHECKING:
+    from consat.robots.description import Robots
+
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
-KEYS: Final = ("consat", "name", "dimension", "count", "agents", "communication", *SETTINGS)
-AGENT_KEYS: Final = ("id", "start", "constraints")
+KEYS: Final = ("consat", "name", "dimension", "count", "agents", "communication", "robots", "obstacles", "rate", *SETTINGS)
+AGENT_KEYS: Final = ("id", "start", "robot", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
 """Keys that constraints of a group have besides those of their kind."""
@@ -48,8 +54,26 @@ class _Faults:
         return {key: data[key] for key in data if key in allowed and data[key] is not None}
 
 
-def build(document: Document) -> tuple[Team, Settings, str | None]:
-    """The team, its settings, and the name if there is one.
+class Built(NamedTuple):
+    """What a scenario file says.
+
+    Attributes:
+        team: the team.
+        settings: of a run.
+        name: if there is one.
+        robots: and obstacles, if there are any.
+        rate: rounds a second, Hz, if it says.
+    """
+
+    team: Team
+    settings: Settings
+    name: str | None
+    robots: Robots | None
+    rate: float | None
+
+
+def build(document: Document) -> Built:
+    """What the file says.
 
     Raises:
         InvalidScenario: with all faults and their places.
@@ -69,6 +93,7 @@ def build(document: Document) -> tuple[Team, Settings, str | None]:
     settings = _settings({key: data[key] for key in SETTINGS if key in data}, dimension, faults)
     agents = _agents(data.get("agents"), data.get("count"), faults)
     links = _links(data.get("communication"), faults)
+    robots, rate = _robots(data, dimension, faults), _rate(data.get("rate"), faults)
     team = None
     try:
         team = Team(agents, links, dimension)
@@ -76,7 +101,93 @@ def build(document: Document) -> tuple[Team, Settings, str | None]:
         faults.take(error.faults)
     if faults.found or document.faults or team is None:
         raise document.invalid(faults.found)
-    return team, settings, name
+    if robots is not None and (crowded := _crowded(robots, team, rate)):
+        raise document.invalid(crowded)
+    return Built(team, settings, name, robots, rate)
+
+
+def _rate(data: Any, faults: _Faults) -> float | None:
+    if data is None:
+        return None
+    if not is_number(data) or not 0 < data <= LARGEST:
+        faults.add(("rate",), f"rate is {shown(data)}, but must be a positive number, rounds a second")
+        return None
+    return float(data)
+
+
+def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots | None:
+    """The robots and the obstacles; None if there are none."""
+    agents = data.get("agents")
+    if not any(key in data for key in ("robots", "obstacles")) and not _any_robot(agents):
+        return None
+    from consat.robots.description import Robots, kind_of, model_of, obstacle_of
+
+    own = [
+        (i, entry) for i, entry in enumerate(agents if isinstance(agents, list) else []) if isinstance(entry, dict) and entry.get("robot")
+    ]
+    common, known = data.get("robots"), len(faults.found)
+    obstacles = data.get("obstacles")
+    if obstacles is not None and not isinstance(obstacles, list):
+        faults.add(
+            ("obstacles",), f"obstacles is {shown(obstacles)}, but must be a list such as [{{kind: disc, center: [0, 0], radius: 1}}]"
+        )
+        obstacles = None
+    made = [
+        each
+        for k, item in enumerate(obstacles or [])
+        if (each := _made(functools.partial(obstacle_of, item), ("obstacles", k), f"obstacles[{k}]", faults)) is not None
+    ]
+    for k, each in enumerate(made):
+        if isinstance(dimension, int) and each.dimension != dimension and 1 <= dimension <= 64:
+            message = f"it lies in {each.dimension} dimensions, but the team has {dimension}"
+            faults.add(("obstacles", k), message, f"obstacles[{k}]")
+    if common is None and not own:
+        if obstacles:
+            faults.add(("obstacles",), "there are obstacles, but no robots to keep clear of them; add robots: {kind: point}")
+        return None
+    base = common if isinstance(common, dict) else {"kind": "point"}
+    whole = _made(functools.partial(model_of, base), ("robots",), "robots", faults)
+    each_own = {
+        str(entry.get("id")): model
+        for i, entry in own
+        if (model := _made(
+            functools.partial(model_of, entry["robot"], f"agent {entry.get('id')!r}, robot", base), ("agents", i, "robot"), "", faults
+        )) is not None
+    }  # fmt: skip
+    if whole is None or len(faults.found) > known:
+        return None
+    for model, path in ((whole, ("robots", "kind")), *((each, ("robots",)) for each in each_own.values())):
+        if isinstance(dimension, int) and dimension not in model.dimensions:
+            allowed = " or ".join(map(str, model.dimensions))
+            faults.add(path, f"{kind_of(model)} robots move in {allowed} dimensions, but the team has {dimension}", "robots")
+            return None
+    return Robots(whole, each_own, tuple(made))
+
+
+def _any_robot(agents: Any) -> bool:
+    return isinstance(agents, list) and any(isinstance(entry, dict) and entry.get("robot") for entry in agents)
+
+
+def _made(make: Callable[[], Any], path: Path, where: str, faults: _Faults) -> Any:
+    """What is made, or None and its faults, which begin at `path`."""
+    try:
+        return make()
+    except InvalidInput as error:
+        faults.take([replace(fault, path=(*path, *fault.path), where=fault.where or where) for fault in error.faults])
+        return None
+
+
+def _crowded(robots: Robots, team: Team, rate: float | None) -> list[Fault]:
+    """Starts within an obstacle, or on top of each other; of those that are given."""
+    from consat.robots.obstacles import map_of, start_faults
+
+    given = np.flatnonzero(np.isfinite(team.starts).all(axis=1))
+    if not len(given):
+        return []
+    size = np.broadcast_to(np.asarray(robots.fleet(list(team.ids)).radius, dtype=float), (team.count,))
+    ids = [team.ids[i] for i in given.tolist()]
+    found = start_faults(ids, team.starts[given], size[given], map_of(robots.obstacles, team.dimension))
+    return [replace(fault, path=("agents", int(given[int(fault.path[1])]), "start")) for fault in found]
 
 
 def _version(data: Mapping[str, Any], faults: _Faults, document: Document) -> None:

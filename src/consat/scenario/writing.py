@@ -10,7 +10,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from consat.scenario.document import resolve
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
 
+if TYPE_CHECKING:
+    from consat.robots.description import Robots
+
 WIDTH: Final = 110
 """Lists and mappings up to this many characters stand on one line."""
 
@@ -34,13 +37,17 @@ _WORDS = re.compile(r"[A-Za-z][\w-]*( [\w-]+)*", re.ASCII)
 _UNPRINTED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
 
 
-def dump(team: Team, settings: Settings | None = None, name: str = "team") -> str:
+def dump(
+    team: Team, settings: Settings | None = None, name: str = "team", *, robots: Robots | None = None, rate: float | None = None
+) -> str:
     """The scenario file of a team; loading it gives the same team.
 
     Args:
         team: built of library constraints and text expressions. A `consat.box` is written as the half-spaces it consists of.
         settings: start, protocol and smoothing are written; the rest is for the command line.
         name: of the scenario.
+        robots: and obstacles, if agents are no points that go where they want.
+        rate: rounds a second, Hz.
 
     Raises:
         InvalidTeam: names the constraints that are Python functions: no file can hold them.
@@ -57,9 +64,14 @@ def dump(team: Team, settings: Settings | None = None, name: str = "team") -> st
         count = {"count": counts.pop()} if shared else {}
     else:
         agents, count = list(singles), {}
+    machines = {} if robots is None else robots.data
+    for agent in agents:
+        if agent.get("id") in (own := machines.get("own", {})):
+            agent["robot"] = own[agent["id"]]
+    about = {key: machines[key] for key in ("robots", "obstacles") if machines.get(key)} | ({} if rate is None else {"rate": rate})
     chosen = (settings or Settings()).model_dump(mode="json", by_alias=True, exclude_defaults=True, include=set(SETTINGS))
     head = {"consat": VERSION, "name": name, "dimension": team.dimension} | count
-    return write(head | {"agents": agents, "communication": _communication(team)} | chosen)
+    return write(head | {"agents": agents, "communication": _communication(team)} | about | chosen)
 
 
 def _agents(team: Team) -> Iterator[dict[str, Any]]:

@@ -343,7 +343,7 @@ def read_part(text: str, file: str) -> Part:
     if document.faults:
         raise document.invalid()
     assert document.root is not None
-    team, settings, name = build(Document(file, document.root.value["scenario"]))
+    team, settings, name, *_ = build(Document(file, document.root.value["scenario"]))
     if faults := list(_unfit(frame, team, settings)):
         raise document.invalid(faults)
     return Part(

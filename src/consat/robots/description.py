@@ -1,0 +1,168 @@
+"""Which robots a team has, and on which map, as a scenario says it and as `consat.run` takes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from consat.errors import Fault, InvalidInput, closest, shown
+from consat.robots.double import Double
+from consat.robots.fleet import Fleet
+from consat.robots.model import Model
+from consat.robots.obstacles import Obstacle, box, disc, polygon
+from consat.robots.point import Point
+from consat.robots.quadrotor import Quadrotor
+from consat.robots.unicycle import Unicycle
+
+KINDS: Final[Mapping[str, Any]] = {"point": Point, "double": Double, "unicycle": Unicycle, "quadrotor": Quadrotor}
+"""What ``kind:`` may say of robots; the other keys are the arguments of the model."""
+SHAPES: Final[Mapping[str, Any]] = {"disc": disc, "box": box, "polygon": polygon}
+"""What ``kind:`` may say of obstacles."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robots:
+    """The robots of a team, and what stands in their way.
+
+    Attributes:
+        common: the robot of every agent that has none of its own.
+        own: those of agents that do, by id.
+        obstacles: the public map.
+    """
+
+    common: Model[Any]
+    own: Mapping[str, Model[Any]] = field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] = ()
+
+    def fleet(self, ids: Sequence[str]) -> Model[Any]:
+        """One model for a team: parameters that differ are arrays, kinds that differ make a `Fleet`."""
+        each = [self.own.get(agent, self.common) for agent in ids]
+        if all(model is each[0] for model in each):
+            return each[0]
+        kinds = list(dict.fromkeys(type(model) for model in each))
+        models = [_stacked(kind, [model for model in each if type(model) is kind]) for kind in kinds]
+        return models[0] if len(kinds) == 1 else Fleet(models, np.array([kinds.index(type(model)) for model in each]))
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """As a scenario file has it: ``robots``, ``obstacles``, and ``robot`` by id."""
+        own = {agent: model_data(model) for agent, model in self.own.items()}
+        return {"robots": model_data(self.common), "obstacles": [obstacle_data(each) for each in self.obstacles], "own": own}
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Robots:
+        """From `data`."""
+        own = {agent: model_of(each) for agent, each in data["own"].items()}
+        return cls(model_of(data["robots"]), own, tuple(obstacle_of(each) for each in data["obstacles"]))
+
+
+def asked(robots: Any, obstacles: Any, known: Robots | None, ids: Sequence[str]) -> Robots | None:
+    """The robots of a run: what is given, else what the scenario has.
+
+    Args:
+        robots: a model for all, a mapping from ids to models, or the name of a kind; None for those of the scenario.
+        obstacles: what `consat.disc` and its like return; None for those of the scenario.
+        known: of the scenario.
+        ids: of the team.
+
+    Raises:
+        InvalidInput: names what cannot be.
+    """
+    place = _map(obstacles, known)
+    if robots is None and known is None and place:
+        raise InvalidInput([Fault(("robots",), "there are obstacles, but no robots to keep clear of them; give robots, too", "robots")])
+    if robots is None or (known is not None and isinstance(robots, str) and robots == kind_of(known.common)):
+        return None if known is None else dataclasses.replace(known, obstacles=place)
+    if isinstance(robots, str):
+        return Robots(model_of({"kind": robots}), {}, place)
+    if isinstance(robots, Mapping):
+        if missing := [agent for agent in ids if agent not in robots]:
+            raise InvalidInput([Fault(("robots",), f"there is none for agent {missing[0]!r}; give one for each agent", "robots")])
+        if unknown := [agent for agent in robots if agent not in set(ids)]:
+            raise InvalidInput([Fault(("robots",), f"there is no agent {shown(unknown[0])}{closest(unknown[0], ids)}", "robots")])
+    models = list(robots.values()) if isinstance(robots, Mapping) else [robots]
+    if wrong := [model for model in models if type(model) not in KINDS.values()]:
+        names = ", ".join(f"consat.{kind.__name__}" for kind in KINDS.values())
+        raise InvalidInput([Fault(("robots",), f"{shown(wrong[0])} is no robot; use one of {names}", "robots")])
+    own = {agent: model for agent, model in robots.items() if model is not models[0]} if isinstance(robots, Mapping) else {}
+    return Robots(models[0], own, place)
+
+
+def _map(obstacles: Any, known: Robots | None) -> tuple[Obstacle, ...]:
+    if obstacles is None:
+        return () if known is None else known.obstacles
+    if wrong := [each for each in obstacles if not isinstance(each, Obstacle)]:
+        raise InvalidInput([Fault(("obstacles",), f"{shown(wrong[0])} is no obstacle; use consat.disc and its like", "obstacles")])
+    return tuple(obstacles)
+
+
+def kind_of(model: Model[Any]) -> str:
+    """What a scenario calls a model."""
+    return next(name for name, kind in KINDS.items() if type(model) is kind)
+
+
+def model_data(model: Model[Any]) -> dict[str, Any]:
+    """A model as a scenario file has it."""
+    return {"kind": kind_of(model)} | {each.name: getattr(model, each.name) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
+
+
+def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
+    """An obstacle as a scenario file has it."""
+    plain = {each.name: getattr(obstacle, each.name) for each in dataclasses.fields(obstacle)}
+    return {"kind": type(obstacle).__name__.lower()} | {key: _listed(value) for key, value in plain.items()}
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(each) for each in value] if isinstance(value, tuple) else value
+
+
+def model_of(data: Any, where: str = "robots", base: Mapping[str, Any] | None = None) -> Model[Any]:
+    """A model from a mapping of a scenario file.
+
+    Args:
+        data: the mapping.
+        where: in words.
+        base: what holds where `data` does not say, if it is of the same kind.
+
+    Raises:
+        InvalidInput: names the key, what is wrong with it, and what would be right; paths begin at the mapping.
+    """
+    return _made(data, KINDS, where, "{kind: unicycle, radius: 0.1}", base)
+
+
+def obstacle_of(data: Any, where: str = "obstacle") -> Obstacle:
+    """An obstacle from a mapping of a scenario file; raises as `model_of`."""
+    made: Obstacle = _made(data, SHAPES, where, "{kind: disc, center: [0, 0], radius: 1}", None)
+    return made
+
+
+def _made(data: Any, kinds: Mapping[str, Any], where: str, example: str, base: Mapping[str, Any] | None) -> Any:
+    if not isinstance(data, Mapping):
+        raise InvalidInput([Fault((), f"it is {shown(data)}, but must be a mapping such as {example}", where)])
+    kind = data.get("kind", None if base is None else base.get("kind"))
+    if kind is None:
+        raise InvalidInput([Fault(("kind",), f"kind is missing; it is one of {', '.join(kinds)}", where)])
+    if not isinstance(kind, str) or kind not in kinds:
+        message = f"there is no kind {shown(kind)}; the kinds are {', '.join(kinds)}{closest(kind, kinds)}"
+        raise InvalidInput([Fault(("kind",), message, where)])
+    keys = list(inspect.signature(kinds[kind]).parameters)
+    if unknown := [key for key in data if key != "kind" and key not in keys]:
+        raise InvalidInput([
+            Fault((key,), f"unknown key {key!r}{closest(key, keys)}; {kind} has {', '.join(keys)}", where) for key in unknown
+        ])  # fmt: skip
+    needed = [name for name, each in inspect.signature(kinds[kind]).parameters.items() if each.default is each.empty]
+    if missing := [name for name in needed if name not in data]:
+        raise InvalidInput([Fault((missing[0],), f"{missing[0]} is missing; {kind} needs {', '.join(needed)}", where)])
+    inherited = {} if base is None or base.get("kind") != kind else {key: value for key, value in base.items() if key != "kind"}
+    return kinds[kind](**{**inherited, **{key: value for key, value in data.items() if key != "kind"}})
+
+
+def _stacked(kind: Any, models: Sequence[Any]) -> Any:
+    """Models of one kind as one, whose parameters are arrays where they differ."""
+    values = {each.name: [getattr(model, each.name) for model in models] for each in dataclasses.fields(kind)}
+    return kind(**{name: own[0] if all(value == own[0] for value in own) else np.array(own) for name, own in values.items()})
