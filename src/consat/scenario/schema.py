@@ -19,7 +19,7 @@ from consat.teams.team import Agent, Links, Team
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
-KEYS: Final = ("consat", "name", "dimension", "count", "agents", "communication", *SETTINGS)
+KEYS: Final = ("consat", "name", "dimension", "unit", "count", "agents", "communication", *SETTINGS)
 AGENT_KEYS: Final = ("id", "start", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
@@ -71,7 +71,7 @@ def build(document: Document) -> tuple[Team, Settings, str | None]:
     links = _links(data.get("communication"), faults)
     team = None
     try:
-        team = Team(agents, links, dimension)
+        team = Team(agents, links, dimension, unit=data.get("unit"))
     except InvalidTeam as error:
         faults.take(error.faults)
     if faults.found or document.faults or team is None:

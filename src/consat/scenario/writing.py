@@ -57,7 +57,7 @@ def dump(team: Team, settings: Settings | None = None, name: str = "team") -> st
     else:
         agents, count = list(singles), {}
     chosen = (settings or Settings()).model_dump(mode="json", by_alias=True, exclude_defaults=True, include=set(SETTINGS))
-    head = {"consat": VERSION, "name": name, "dimension": team.dimension} | count
+    head = {"consat": VERSION, "name": name, "dimension": team.dimension} | ({} if team.unit is None else {"unit": team.unit}) | count
     return write(head | {"agents": agents, "communication": _communication(team)} | chosen)
 
 

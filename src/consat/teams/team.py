@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consat.constraints.record import OWNER, Constraint, Number, flatten
+from consat.constraints.record import OWNER, Constraint, Constraints, Number, flatten
 from consat.errors import Fault, InvalidTeam, closest, shown
 from consat.teams.entries import SUGGESTIONS, Entry, alike, trace
 from consat.teams.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MOST_NAMED = 100_000
 """Up to so many constraints have their names made at once; of more, a name is made when asked for."""
+
+LONGEST_UNIT = 16
 
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
@@ -40,7 +42,7 @@ class Agent:
     """
 
     id: str
-    constraints: Sequence[Any] = ()
+    constraints: Constraints = ()
     start: ArrayLike | None = None
 
 
@@ -52,6 +54,7 @@ class Team:
         links: who talks to whom: pairs of ids, a `networkx.Graph` over ids, an (L, 2) array of places in `ids`, or one of `TOPOLOGIES`
             (``task`` links agents along the task graph, the default).
         dimension: d ≥ 1.
+        unit: what lengths are measured in, such as ``m``, for figures and exports; if None, they name none.
 
     Raises:
         InvalidTeam: names every fault, its agent and constraint, and the cure.
@@ -67,6 +70,7 @@ class Team:
             it; NaN where nobody says. None if nobody says of anyone.
         members: the agents and groups as given; None if the constraints have been changed since.
         dimension: d.
+        unit: of lengths, or None.
     """
 
     ids: Sequence[str]
@@ -78,8 +82,9 @@ class Team:
     around: tuple[np.ndarray, np.ndarray] | None
     members: tuple[Agent | Group, ...] | None
     dimension: int
+    unit: str | None
 
-    def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2) -> None:
+    def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2, *, unit: str | None = None) -> None:
         self.members = tuple(agents)
         faults: list[Fault] = []
         if isinstance(dimension, bool) or not isinstance(dimension, int | np.integer) or not 1 <= dimension <= 64:
@@ -87,6 +92,10 @@ class Team:
             dimension = 0
         if not self.members:
             faults.append(Fault(("agents",), "a team needs at least one agent", "agents"))
+        if unit is not None and not (isinstance(unit, str) and unit.strip() and unit.isprintable() and len(unit) <= LONGEST_UNIT):
+            what = f"unit is {shown(unit)}, but must be a printable text of at most {LONGEST_UNIT} letters, such as m"
+            faults.append(Fault(("unit",), what, "unit"))
+        self.unit = unit
         self.dimension = int(dimension)
         index = Index(self.members, self.dimension, faults)
         self.ids = index.ids
