@@ -125,6 +125,21 @@ def alike(team: Team) -> np.ndarray:
     return found
 
 
+def boxes(team: Team) -> np.ndarray:
+    """(B, 2, d) the different boxes that agents must be in, low and high."""
+    lows, highs = (
+        {
+            int(owner): corner
+            for family in team.families
+            if family.kind == "box" and family.sources is None and side in family.parameters
+            for owner, corner in zip(family.owner, family.parameters[side], strict=True)
+        }
+        for side in ("low", "high")
+    )
+    both = [np.stack([lows[owner], highs[owner]]) for owner in sorted(lows.keys() & highs.keys())]
+    return np.unique(np.array(both, dtype=float).reshape(-1, 2, team.dimension), axis=0)
+
+
 def _distinct(team: Team) -> Iterator[tuple[Hashable, Family, int]]:
     """Every constraint with a key that those with the same region share: function, parameters, and whom it reads besides its owner."""
     for place, family in enumerate(team.families):
