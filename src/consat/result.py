@@ -109,10 +109,22 @@ class Result:
         return figures.save(self, directory) if directory is not None else figures.show(self)
 
     def animate(self, path: str | os.PathLike[str]) -> Path:
-        """The run as an animated GIF; see `consat.views.animation`."""
+        """The run as an animated GIF, or an MP4 video; see `consat.views.animation`."""
         from consat.views import animation
 
         return animation.save(self, path)
+
+    def html(self, path: str | os.PathLike[str]) -> Path:
+        """The run as one HTML file that replays it offline; see `consat.views.replay`."""
+        from consat.views import replay
+
+        return replay.save(self, path)
+
+    def export(self, path: str | os.PathLike[str]) -> Path:
+        """The run as a file of another kind, which the ending says: .csv, .gif, .html, .mcap, .mp4; see `consat.views.export`."""
+        from consat.views import export
+
+        return export.save(self, path)
 
     def __str__(self) -> str:
         from consat.views import words

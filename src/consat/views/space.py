@@ -66,33 +66,45 @@ def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: A
 
 def walls(axes: Any, found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[Artist]:
     """Half-spaces within the view, each cut by the others of the same owners, so that the sides of a box make a box."""
+    for k, corners in faces(found, low, high):
+        shade = _shade(found.owners[k])
+        look: dict[str, Any] = {"facecolors": [to_rgba(shade, 0.08)], "edgecolors": [to_rgba(shade, 0.8)], "linewidths": 1.0}
+        face = Poly3DCollection([corners], **look, gid="region", zorder=0.4)
+        yield axes.add_collection3d(face, autolim=False)
+
+
+def faces(found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Number and corners, (C, d), of each half-space's boundary within a box, cut by the others of the same owners; a line in the plane."""
     for k, (normal, offset) in enumerate(zip(found.normal, found.offset, strict=True)):
         corners = _face(normal, offset, low, high)
         for j, owners in enumerate(found.owners):
             if j != k and owners == found.owners[k]:
                 corners = _cut(corners, found.normal[j], found.offset[j])
-        if len(corners) >= 3:
-            shade = _shade(found.owners[k])
-            look: dict[str, Any] = {"facecolors": [to_rgba(shade, 0.08)], "edgecolors": [to_rgba(shade, 0.8)], "linewidths": 1.0}
-            face = Poly3DCollection([corners], **look, gid="region", zorder=0.4)
-            yield axes.add_collection3d(face, autolim=False)
+        if len(corners) >= 2:
+            yield k, corners[: None if len(normal) > 2 else 2]
 
 
 def _face(normal: np.ndarray, offset: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(C, 3) corners of a plane normal·x = offset within a box; a square around the middle of the view, cut by the sides of the box."""
-    middle = (low + high) / 2
+    """(C, d) corners of a plane normal·x = offset within a box: a square around the middle of the view, cut by the sides of the box."""
+    middle, sides = (low + high) / 2, np.eye(len(low))
     foot, size = middle + (offset - middle @ normal) * normal, 2 * float(np.linalg.norm(high - low))
+    if len(low) == 2:
+        along = np.array([-normal[1], normal[0]])
+        corners = foot + size * np.array([-along, along])
+        for k, side in enumerate(sides):
+            corners = _cut(_cut(corners, side, high[k]), -side, -low[k])
+        return corners
     across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
     up = np.cross(normal, across)
     corners = foot + size * np.array([across + up, across - up, -across - up, -across + up])
-    for k, side in enumerate(np.eye(3)):
+    for k, side in enumerate(sides):
         corners = _cut(_cut(corners, side, high[k]), -side, -low[k])
     return corners
 
 
 def _cut(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    """What of a convex polygon (C, 3) has normal·x ≤ offset (Sutherland and Hodgman, 1974)."""
+    """What of a convex polygon (C, d) has normal·x ≤ offset (Sutherland and Hodgman, 1974)."""
     kept: list[np.ndarray] = []
     beyond = corners @ normal - offset if len(corners) else np.zeros(0)
     for k, (here, there) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -101,7 +113,7 @@ def _cut(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
             kept.append(here)
         if (a < 0 < b) or (b < 0 < a):
             kept.append(here + a / (a - b) * (there - here))
-    return np.array(kept).reshape(-1, 3)
+    return np.array(kept).reshape(-1, len(normal))
 
 
 def sections(axes: Any, team: Team, numbers: Sequence[int], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[Artist]:
