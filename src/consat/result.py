@@ -7,12 +7,13 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from consat.errors import InvalidResult
 from consat.netcdf import FINAL, SCHEMA, UNITS, VARIABLES, axis_names
+from consat.summaries import RunSummary
 from consat.teams.team import Team
 from consat.trace import Trace
 
@@ -40,7 +41,7 @@ class Result:
 
     def __init__(self, summary: Mapping[str, Any], data: xr.Dataset | None = None, *, trace: Trace | None = None, team: Team | None = None,
                  scenario: str | None = None) -> None:  # fmt: skip
-        self.summary = dict(summary)
+        self.summary = cast(RunSummary, dict(summary))
         self.scenario = scenario
         self._data = data
         self._trace = trace
@@ -142,6 +143,11 @@ class Result:
         from consat.central.reference import max_min
 
         return explain(team, max_min(team))
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.result(self)
 
     def __repr__(self) -> str:
         return f"<Result of {self.summary['scenario']}: {self.summary['status']}, margin {self.summary['margin']}>"

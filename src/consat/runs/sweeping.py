@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from consat.simulate import Stop
 from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
 from consat.simulate.kernel import Weather, world_of
 from consat.simulate.rounds import PATIENCE, Rules, longest_hold, stillness
+from consat.summaries import SweepSummary
 from consat.teams.team import Team
 
 SCHEMA = "consat.sweep/1"
@@ -52,7 +53,7 @@ class Sweep:
     """
 
     def __init__(self, summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> None:
-        self.summary = dict(summary)
+        self.summary = cast(SweepSummary, dict(summary))
         self.runs = list(runs)
 
     def save(self, directory: str | os.PathLike[str]) -> list[Path]:
@@ -76,6 +77,11 @@ class Sweep:
         from consat.views import words
 
         return words.sweep(self.summary)
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.sweep(self.summary, self.runs)
 
 
 def values(text: str) -> list[Any]:
@@ -297,7 +303,7 @@ class _Asked:
                 agents="none",
                 record=False,
             )
-            told = result.summary
+            told: Mapping[str, Any] = {**result.summary}
             since = told["satisfied_from"]["round"] if told["rounds"] is not None else told["satisfied_from"]["time"]
             satisfied += told["status"] == "satisfied"
             progress((k + 1) / total, satisfied / (k + 1))

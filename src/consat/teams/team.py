@@ -192,6 +192,11 @@ class Team:
         """(N,) m_i."""
         return np.bincount(self.owner, minlength=self.count)
 
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.team(self)
+
     def __repr__(self) -> str:
         return f"Team({self.count} agents, {len(self.owner)} constraints, {len(self.links)} links, dimension={self.dimension})"
 

@@ -191,7 +191,7 @@ def margins(result: Result) -> Figure:
     if lower is not None and upper is not None:
         proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
         axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
-    since = (summary.get("satisfied_from") or {}).get(clock)
+    since = summary["satisfied_from"]["time" if clock == "time" else "round"]
     if since is not None:
         axes.axvline(since, color=COLOURS[3], linewidth=1.5, linestyle=":")
         label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"

@@ -109,12 +109,14 @@ def _facts(result: Result) -> Iterator[tuple[str, str]]:
             f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
         )
     since = summary["satisfied_from"]
-    if since["time"] is not None or since["round"] is not None:
-        yield "satisfied from", f"round {since['round']}" if since["round"] is not None else f"t = {number(since['time'])} s"
+    if since["round"] is not None:
+        yield "satisfied from", f"round {since['round']:.0f}"
+    elif since["time"] is not None:
+        yield "satisfied from", f"t = {number(since['time'])} s"
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
-    for key, label in (("rounds", "rounds"), ("messages", "messages")):
-        if summary.get(key) is not None:
-            yield label, f"{summary[key]:,}"
+    for name, count in (("rounds", summary["rounds"]), ("messages", summary["messages"])):
+        if count is not None:
+            yield name, f"{count:,}"
     for reason in result.reasons:
         yield "in the way", reason
 
@@ -159,7 +161,7 @@ def document(result: Result) -> dict[str, Any]:
     margin, agent_margin, steps = (data[name].values[chosen] for name in ("margin", "agent_margin", clock))
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
-    since = (summary.get("satisfied_from") or {}).get(clock)
+    since = summary["satisfied_from"]["time" if clock == "time" else "round"]
     return {
         "schema": SCHEMA,
         "name": summary["scenario"],
