@@ -106,16 +106,18 @@ class Ground:
     def __init__(self, axes: Any, team: Team, found: Sequence[Area], unit: np.ndarray) -> None:
         self.found, self._unit = found, unit
         first = alike(team)
-        bounded: dict[frozenset[int], list[int]] = {}
         closed = {area.number for area in found if not area.keeps_out}
-        for owner in np.unique(team.owner):
-            mine = frozenset(int(number) for number in first[np.flatnonzero(team.owner == owner)])
-            if mine & closed:  # else all but some holes would be tinted
-                bounded.setdefault(mine, []).append(int(owner))
+        alike_goals: dict[frozenset[int], list[int]] = {}
+        mine: dict[int, set[int]] = {}
+        for owner in map(int, np.unique(team.owner)):
+            mine[owner] = set(first[np.flatnonzero(team.owner == owner)].tolist())
+            if mine[owner] & closed:  # else all but some holes would be tinted
+                alike_goals.setdefault(frozenset(mine[owner] & closed), []).append(owner)
         self._common: list[tuple[list[int], PathPatch]] = []
-        for mine, owners in bounded.items():
+        for owners in alike_goals.values():
             tint = colour(owners[0]) if len(owners) == 1 else SHARED
-            self._common.append((sorted(mine), _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.5)))
+            numbers = sorted(set.intersection(*(mine[owner] for owner in owners)))
+            self._common.append((numbers, _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.5)))
         self._edges = [
             _patch(axes, "boundary", fill=False, edgecolor=area.colour, linestyle=area.style, **_weight(area), zorder=2) for area in found
         ]

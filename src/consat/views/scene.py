@@ -254,7 +254,7 @@ class Scene:
         if any(area.leaves for area in self._areas):
             yield line(color=GREY, marker=3, linewidth=1.2, label="forbidden side")
         if not self._space:
-            yield line(color=GREY, linewidth=8, alpha=0.25, solid_capstyle="butt", label="all of an agent's ψ > 0")
+            yield line(color=GREY, linewidth=8, alpha=0.25, solid_capstyle="butt", label="where an agent may be")
 
     def _owners(self, area: Area) -> str:
         names = [self._ids[owner] for owner in area.owners]
