@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection
 from PIL import Image
 
 from consat.errors import InvalidSettings
@@ -67,10 +68,9 @@ def frames(result: Result, count: int, progress: Callable[[float], None] | None 
     scene.show(scene.last)
     canvas.draw()  # lays everything out, for good
     scene.figure.set_layout_engine("none")
-    space = scene.x.shape[2] == 3
     scene.axes.set_title("")
     for artist in scene.moving:
-        artist.set_visible(space)
+        artist.set_visible(False)
     canvas.draw()
     background = canvas.copy_from_bbox(scene.figure.bbox)
     for artist in scene.moving:
@@ -79,12 +79,11 @@ def frames(result: Result, count: int, progress: Callable[[float], None] | None 
     for k, moment in enumerate(np.pad(moving, (0, count // 10), "edge")):
         if k < len(moving):
             scene.show(moment)
-            if space:
-                canvas.draw()
-            else:
-                canvas.restore_region(background)
-                for artist in sorted([*scene.moving, scene.axes.title], key=Artist.get_zorder):
-                    scene.axes.draw_artist(artist)
+            canvas.restore_region(background)
+            for artist in sorted([*scene.moving, scene.axes.title], key=Artist.get_zorder):
+                if isinstance(artist, Collection) and scene.x.shape[2] == 3:
+                    artist.do_3d_projection()  # type: ignore[attr-defined]
+                scene.axes.draw_artist(artist)
             picture = np.array(canvas.buffer_rgba())[:, :, :3]
         yield picture
         if progress is not None:

@@ -21,7 +21,7 @@ from matplotlib.path import Path
 
 from consat.teams.team import Team
 from consat.views.figures import STYLES, colour
-from consat.views.shapes import BALLS, alike
+from consat.views.shapes import BALLS, alike, moves
 
 SHARED: Final = "0.3"
 """The colour of what several agents share."""
@@ -61,12 +61,9 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
         team: the team.
         values: (M, L, K) every ψ over a grid; without them only library kinds are known to keep out.
     """
-    first, owners, found = alike(team), np.asarray(team.owner), []
+    first, owners, ties, found = alike(team), np.asarray(team.owner), moves(team), []
     kinds = {int(number): family.kind for family in team.families if family.sources is None for number in family.number}
     ranks: dict[int, dict[str, int]] = defaultdict(dict)
-    ties = np.zeros(len(owners), dtype=bool)
-    for family in team.families:
-        ties[family.number] = family.arity > 1
     for number in map(int, np.flatnonzero(first == np.arange(len(first)))):
         mine = tuple(sorted({int(owner) for owner in owners[first == number]}))
         kind, name = kinds.get(number, ""), team.names[number]
@@ -78,8 +75,9 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
             keeps_out = keeps_out or bool((values[number] < 0).any() and (edge > 0).all())
             leaves = bool(not keeps_out and (edge > 0).any() and (edge < 0).any())
         shade = colour(mine[0]) if len(mine) == 1 else SHARED
-        moves = bool(ties[number])
-        found.append(Area(number, name, mine, keeps_out, leaves, moves, shade, "-" if keeps_out else STYLES[rank % len(STYLES)]))
+        found.append(
+            Area(number, name, mine, keeps_out, leaves, bool(ties[number]), shade, "-" if keeps_out else STYLES[rank % len(STYLES)])
+        )
     return found
 
 

@@ -18,8 +18,8 @@ from consat.errors import InvalidSettings
 from consat.result import Result
 from consat.views import space
 from consat.views.figures import colour, recorded, view
-from consat.views.outlines import MOST, moves, outlines
-from consat.views.shapes import Balls, Shapes, Walls, boxes, shapes
+from consat.views.outlines import MOST, outlines
+from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
 if TYPE_CHECKING:
     from foxglove.messages import Color, SceneEntity

@@ -32,11 +32,3 @@ def outlines(team: Team, numbers: Sequence[int], x: np.ndarray, low: np.ndarray,
     chosen = [family for family in team.families if np.isin(family.number, numbers).any()]
     values = regions(team, x, points, chosen)
     return [list(contours(along[0], along[1], values[k].reshape(FINE, FINE).T)) for k in numbers]
-
-
-def moves(team: Team) -> np.ndarray:
-    """(M,) whether the region of a constraint moves with teammates."""
-    found = np.zeros(len(team.owner), dtype=bool)
-    for family in team.families:
-        found[family.number] = family.arity > 1
-    return found

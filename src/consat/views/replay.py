@@ -27,8 +27,8 @@ from consat.teams.team import Team
 from consat.views import space, words
 from consat.views.colours import classes
 from consat.views.figures import number, recorded, view
-from consat.views.outlines import MOST, moves, outlines
-from consat.views.shapes import boxes, shapes
+from consat.views.outlines import MOST, outlines
+from consat.views.shapes import boxes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000

@@ -22,7 +22,7 @@ from consat.views import areas, space
 from consat.views.areas import SHARED, Area, Ground
 from consat.views.colours import AREA, LINK, TRAIL, classes
 from consat.views.figures import GREY, colour, grid, label, marker, number, plain, recorded, regions, view
-from consat.views.shapes import Shapes, boxes, shapes
+from consat.views.shapes import Shapes, boxes, moves, shapes
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
@@ -93,7 +93,9 @@ class Scene:
         if own:
             height = max(5.2, 0.6 + 0.235 * rows)  # at low resolutions letters are taller
             self.figure.set_size_inches(1.5 + (height - 0.8) * ratio + 0.08 * letters, height + 0.6 * (not self._few))
-        if not self._space:
+        if self._space:
+            list(self._bodies(self.x[self.last], moving=False))
+        else:
             self._cast()
 
     # ---- what stays
@@ -295,7 +297,8 @@ class Scene:
         if self._space:
             for artist in self.moving:
                 artist.remove()
-            self.moving = [*self._bodies(moment), *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
+            bodies = self._bodies(_between(self.x, moment)[0], moving=True)
+            self.moving = [*bodies, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
             self.moving += self._agents(trail) if self._few else self._crowd(trail, sample)
             style: dict[str, Any] = {"color": LINK, "linewidth": 1 if self._few else 0.6, "linestyle": DOTS, "gid": "link"}
             self.moving += self.axes.plot(*_joined(trail[-1][self._links]), **style)
@@ -350,15 +353,18 @@ class Scene:
     def _shades(self, margins: np.ndarray) -> Any:
         return self._colours.to_rgba(np.ma.masked_invalid(margins))
 
-    def _bodies(self, moment: float) -> Iterator[Artist]:
-        """Regions in space."""
+    def _bodies(self, x: np.ndarray, *, moving: bool) -> Iterator[Artist]:
+        """Regions in space with the team at x (N, d): those that move with agents, or those that stay."""
         if self._team is None or self._shapes is None:
             return
-        x = _between(self.x, moment)[0]
-        yield from space.balls(self.axes, self._shapes.balls, x, space.chosen(self._shapes), None if self._few else AREA)
-        yield from space.walls(self.axes, self._shapes.walls, self._low, self._high)
-        if self._few and len(self._shapes.others):
-            yield from space.sections(self.axes, self._team, self._shapes.others.tolist(), x, self._low, self._high)
+        found, ties = self._shapes, moves(self._team)
+        chosen = [k for k in space.chosen(found) if (found.balls.around[k] >= 0) == moving]
+        yield from space.balls(self.axes, found.balls, x, chosen, None if self._few else AREA)
+        if not moving:
+            yield from space.walls(self.axes, found.walls, self._low, self._high)
+        others = [k for k in found.others.tolist() if ties[k] == moving]
+        if self._few and others:
+            yield from space.sections(self.axes, self._team, others, x, self._low, self._high)
 
     def _agents(self, trail: np.ndarray) -> Iterator[Artist]:
         """A few agents in space."""

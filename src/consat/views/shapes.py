@@ -125,6 +125,14 @@ def alike(team: Team) -> np.ndarray:
     return found
 
 
+def moves(team: Team) -> np.ndarray:
+    """(M,) whether the region of a constraint moves with teammates."""
+    found = np.zeros(len(team.owner), dtype=bool)
+    for family in team.families:
+        found[family.number] = family.arity > 1
+    return found
+
+
 def boxes(team: Team) -> np.ndarray:
     """(B, 2, d) the different boxes that agents must be in, low and high."""
     lows, highs = (

@@ -18,6 +18,8 @@ from consat.views.shapes import Balls, Shapes, Walls
 
 MOST_BALLS: Final = 60
 """Of more balls only those that keep agents out, and of those not more than this, are drawn."""
+MOST_FINE: Final = 12
+"""Of more balls each has fewer faces."""
 SECTION: Final = 61
 FLOOR: Final = "0.55"
 
@@ -42,10 +44,11 @@ def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: A
         chosen: which of them.
         goal: the colour of goals; if None, those of their owners.
     """
-    angle = np.linspace(0, 2 * np.pi, 49)
+    many = len(chosen) > MOST_FINE
+    angle = np.linspace(0, 2 * np.pi, 25 if many else 49)
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     rings = np.stack([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
-    surface, centers = _sphere(25, 13), found.at(x)
+    surface, centers = _sphere(*((13, 7) if many else (25, 13))), found.at(x)
     for k in chosen:
         solid, center, radius = bool(found.keeps_out[k]), centers[k], found.radius[k]
         shade = _shade(found.owners[k]) if goal is None else SHARED if solid else goal
