@@ -146,6 +146,9 @@ def test_mcap_holds_regions_keep_outs_links_and_names(tmp_path: Path) -> None:
     first, later = names(found[0][1]), names(found[1][1])
     assert first == ["keep-out 1", "links", "names", "region 0", "region 3", "region 5", "wall 2"]
     assert later == ["links", "names", "region 3"]  # what stands still is told once
+    entities = [dict(fields(entity)) for field, entity in fields(found[-1][1]) if field == 2]
+    [links] = [dict(fields(entity[11])) for entity in entities if entity[3] == b"links"]
+    assert links[1] == 2  # a list of lines: each two points are one
 
 
 # ---- the page

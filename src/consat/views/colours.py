@@ -39,11 +39,8 @@ def classes(margins: np.ndarray) -> tuple[Colormap, BoundaryNorm, np.ndarray, Li
     red = np.linspace(0.04, 0.36, reds) if reds > 1 else np.full(reds, 0.12)
     blue = np.linspace(0.64, 0.96, blues) if blues > 1 else np.full(blues, 0.85)
     shades = colormaps["RdBu"](np.concatenate([red, blue]))
-    ends: dict[str, Any] = {
-        "under": colormaps["RdBu"](red[0] if reds else 0.12),
-        "over": colormaps["RdBu"](blue[-1] if blues else 0.85),
-        "bad": "0.8",
-    }
+    under, over = red[0] if reds else 0.12, blue[-1] if blues else 0.85
+    ends: dict[str, Any] = {"under": colormaps["RdBu"](under), "over": colormaps["RdBu"](over), "bad": "0.8"}
     palette: Colormap = ListedColormap(shades).with_extremes(**ends)
     return palette, BoundaryNorm(edges, len(shades)), edges, "min" if not reds else "max" if not blues else "neither"
 
