@@ -16,6 +16,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cbook import is_math_text
+from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -309,7 +310,9 @@ def test_scale_of_margins_splits_at_zero_and_is_used_as_a_whole(margins: list[fl
 @pytest.mark.parametrize("count", [13, 50])
 def test_a_crowd_has_a_legend_regions_keep_outs_and_links_unlike_paths(count: int) -> None:
     figure = figures.formation(crowd(count))
-    [discs] = named(figure, "region")
+    [union] = named(figure, "region")
+    assert union.get_path().contains_point((4, 0.5))
+    [discs] = [edges for edges in named(figure, "boundary") if isinstance(edges, EllipseCollection)]
     assert len(discs.get_offsets()) == count
     assert len(patches(figure, "keep-out")) == 1
     [told] = figure.legends
@@ -590,9 +593,10 @@ def test_scene_shows_what_is_between_samples() -> None:
 def test_scene_leaves_nothing_behind() -> None:
     shown = scene.Scene(made(tug(), GREETING))
     shown.show(0)
-    before = len(shown.axes.get_children())
-    shown.show(0)
+    before, moving = len(shown.axes.get_children()), list(shown.moving)
+    shown.show(5)
     assert len(shown.axes.get_children()) == before
+    assert shown.moving == moving  # the same artists, moved: to make them anew took most of the time of a film
 
 
 def test_film_dwells_on_what_moves() -> None:

@@ -115,7 +115,7 @@ class Ground:
         for owners in alike_goals.values():
             tint = colour(owners[0]) if len(owners) == 1 else SHARED
             numbers = sorted(set.intersection(*(mine[owner] for owner in owners)))
-            self._common.append((numbers, _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.5)))
+            self._common.append((numbers, _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.6)))
         self._edges = [
             _patch(axes, "boundary", fill=False, edgecolor=area.colour, linestyle=area.style, **_weight(area), zorder=2) for area in found
         ]

@@ -145,6 +145,20 @@
       pen.globalAlpha = 1;
     }
 
+    // The goals of a crowd: overlaps are tinted once, and of very many no edges are drawn.
+    function drawUnion(frame) {
+      const goals = scene.balls.filter((ball) => !ball.out && ball.around < 0);
+      pen.beginPath();
+      for (const ball of goals) {
+        const [px, py] = project(...ballCenter(frame, ball)), r = scale * ball.radius;
+        pen.moveTo(px + r, py); pen.arc(px, py, r, 0, 2 * Math.PI);
+      }
+      pen.fillStyle = pen.strokeStyle = theme.area; pen.lineWidth = 0.8;
+      pen.globalAlpha = 0.12; pen.fill();
+      if (goals.length <= 200) { pen.globalAlpha = 0.6; pen.stroke(); }
+      pen.globalAlpha = 1;
+    }
+
     function drawWall(wall) {
       const colour = ownerColour(wall.owners, false);
       pen.strokeStyle = colour; pen.lineWidth = 1.4; pen.fillStyle = colour;
@@ -303,7 +317,9 @@
       if (scene.space) drawAxes();
       if (show.regions) {
         scene.walls.forEach(drawWall);
-        for (const out of [false, true]) for (const ball of scene.balls) if (ball.out === out && !ball.owners.includes(show.chosen)) drawBall(frame, ball, false);
+        if (!scene.few && !scene.space) drawUnion(frame);
+        const alone = (ball) => ball.out || scene.few || scene.space;
+        for (const out of [false, true]) for (const ball of scene.balls) if (alone(ball) && ball.out === out && !ball.owners.includes(show.chosen)) drawBall(frame, ball, false);
         for (const outline of scene.outlines) drawOutline(frame, outline);
       }
       for (const ball of scene.balls) if (ball.owners.includes(show.chosen)) drawBall(frame, ball, true);

@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
@@ -26,7 +26,7 @@ from consat.views.shapes import Shapes, boxes, moves, shapes
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
-"""Of a crowd: constraints of which regions are drawn at all, keep-outs that are hatched, walls, other ψ, regions that are tinted."""
+"""Of a crowd: constraints of which regions are drawn at all, keep-outs that are hatched, walls, other ψ, regions that have edges."""
 GRID = 241
 """Points along each side of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
@@ -169,17 +169,19 @@ class Scene:
         center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
         goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
         self._kinds = {"goal": len(goals), "bar": len(bars)}
-        tinted = len(goals) <= MOST_TINTED
         look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
         if len(goals):
+            discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # all of one sense, so that overlaps are tinted once
+            union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
+            axes.add_artist(union)
+        if 0 < len(goals) <= MOST_TINTED:
             size = 2 * found.balls.radius[goals]
-            face, edge = (0.08, 0.6) if tinted else (0.02, 0.35)
-            ring: dict[str, Any] = {"facecolors": [(*AREA, face)], "edgecolors": [(*AREA, edge)], "linewidths": 0.7}
-            axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.5, gid="region", **ring, **look))
+            ring: dict[str, Any] = {"facecolors": "none", "edgecolors": [(*AREA, 0.55)], "linewidths": 0.7, "gid": "boundary"}
+            axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.7, **ring, **look))
         if len(bars) > MOST_HATCHED:
             size = 2 * found.balls.radius[bars]
             dark: dict[str, Any] = {"facecolors": [(0.3, 0.3, 0.3, 0.35)], "edgecolors": [(0.3, 0.3, 0.3, 0.8)], "linewidths": 0.6}
-            axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.6, gid="keep-out", **dark, **look))
+            axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.8, gid="keep-out", **dark, **look))
         for k in bars if len(bars) <= MOST_HATCHED else ():
             areas.hatched(axes, SHARED).set_path(Path.circle(center[k], found.balls.radius[k]))
             axes.add_artist(Circle(center[k], found.balls.radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
