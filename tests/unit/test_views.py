@@ -494,10 +494,10 @@ def test_regions_keep_outs_and_boxes_are_drawn_in_space() -> None:
     figure = figures.formation(made(team, np.ones((2, 3)), spread=1.0))
     drawn(figure)
     rings = [np.concatenate(lines._segments3d) for lines in named(figure, "boundary")]
-    centers = [[0, 1, 2], [4, 0, 0], [1, 1, 1]]
-    for points, center, radius in zip(rings[:3], centers, [1, 1.5, 1], strict=True):
+    within, outside, section, near = rings
+    for points, center, radius in ((within, [0, 1, 2], 1), (outside, [4, 0, 0], 1.5), (near, [1, 1, 1], 1)):
         assert np.linalg.norm(points - center, axis=1) == pytest.approx(radius)
-    psi = 4 - rings[3][:, 0] ** 2 - rings[3][:, 1] ** 2 - 2 * rings[3][:, 2] ** 2
+    psi = 4 - section[:, 0] ** 2 - section[:, 1] ** 2 - 2 * section[:, 2] ** 2
     assert np.abs(psi).max() < 0.1  # between grid points a section interpolates
     solids = named(figure, "keep-out")
     assert len(solids) == 1
