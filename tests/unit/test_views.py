@@ -16,8 +16,8 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cbook import is_math_text
-from matplotlib.colors import to_hex
-from matplotlib.contour import QuadContourSet
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
@@ -29,7 +29,7 @@ from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.results.trace import Trace, satisfied_from
-from consat.views import animation, figures, scene, words
+from consat.views import animation, colours, figures, scene, words
 
 GREETING = np.array([[2.0, 0.0], [-0.6, 0.0], [-2.0, 0.0]])
 
@@ -98,16 +98,21 @@ def made(
     return Result(summary | changes, trace=trace, team=team)
 
 
-def boundaries(figure: Figure) -> list[QuadContourSet]:
-    return [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet) and not artist.filled]
+def patches(figure: Figure, gid: str) -> list[Any]:
+    """What is drawn on the axes under a name."""
+    return [patch for patch in figure.axes[0].patches if patch.get_gid() == gid and len(patch.get_path().vertices)]
 
 
-def shadings(figure: Figure) -> list[QuadContourSet]:
-    return [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet) and artist.filled]
+def boundaries(figure: Figure) -> list[Any]:
+    return patches(figure, "boundary")
 
 
-def vertices(edge: QuadContourSet) -> np.ndarray:
-    return np.concatenate([path.vertices for path in edge.get_paths()])
+def shadings(figure: Figure) -> list[Any]:
+    return patches(figure, "region")
+
+
+def vertices(patch: Any) -> np.ndarray:
+    return np.asarray(patch.get_path().vertices)
 
 
 def cell(figure: Figure) -> float:
@@ -146,7 +151,7 @@ def test_region_of_a_tie_is_around_the_teammate_where_it_ends() -> None:
     figure = figures.formation(made(tug(), GREETING))
     centers, radii = GREETING[[0, 0, 2, 2]] * [1, 0], [1.0, 3.0, 2.0, 1.0]
     edges = boundaries(figure)
-    assert [to_hex(edge.get_edgecolor()[0]) for edge in edges] == [figures.colour(i).lower() for i in (0, 1, 1, 2)]
+    assert [to_hex(edge.get_edgecolor()) for edge in edges] == [figures.colour(i).lower() for i in (0, 1, 1, 2)]
     for edge, center, radius in zip(edges, centers, radii, strict=True):
         assert np.linalg.norm(vertices(edge) - center, axis=1) == pytest.approx(radius, abs=cell(figure) ** 2)
 
@@ -155,7 +160,7 @@ def test_shading_is_where_all_constraints_of_the_agent_hold() -> None:
     figure = figures.formation(made(tug(), GREETING))
     shade = shadings(figure)[1]
     lens = [[-0.5, 0.0], [-0.7, 1.0], [0.5, 0.0], [-1.5, 0.0]]  # the second is near both, the others near one only
-    inside = [any(path.contains_point(point) for path in shade.get_paths()) for point in lens]
+    inside = [shade.get_path().contains_point(point) for point in lens]
     assert inside == [True, True, False, False]
 
 
@@ -163,16 +168,50 @@ def test_nothing_is_shaded_where_constraints_exclude_each_other() -> None:
     end = np.array([[0.98, 0.0], [-0.41, 0.0], [-0.98, 0.0]])
     figure = figures.formation(made(tug(1.4, 0.4), end))
     assert len(boundaries(figure)) == 4
-    assert [to_hex(shade.get_facecolor()[0]) for shade in shadings(figure)] == [figures.colour(i).lower() for i in (0, 2)]
+    assert [to_hex(shade.get_facecolor()) for shade in shadings(figure)] == [figures.colour(i).lower() for i in (0, 2)]
 
 
-@pytest.mark.parametrize(("constraint", "outwards"), [(cs.within([0, 0], 1), True), (cs.outside([0, 0], 1), False)])
-def test_ticks_stand_on_the_side_where_the_constraint_fails(constraint: cs.Constraint, outwards: bool) -> None:
-    figure = figures.formation(made(cs.Team([cs.Agent("a", [constraint])]), np.array([[0.5, 0.2]])))
-    [strokes] = [line for line in figure.axes[0].lines if line.get_linewidth() == 0.8]
-    feet, tips = strokes.get_xydata().reshape(-1, 3, 2)[:, :2].swapaxes(0, 1)
-    assert np.linalg.norm(feet, axis=1) == pytest.approx(1.0, abs=1e-2)  # chords of the polygon
-    assert np.all((np.linalg.norm(tips, axis=1) > np.linalg.norm(feet, axis=1)) == outwards)
+def test_ticks_stand_on_the_side_where_the_constraint_fails() -> None:
+    figure = figures.formation(made(cs.Team([cs.Agent("a", [cs.halfspace([1, 0], 1)])]), np.array([[0.5, 0.2]])))
+    [strokes] = patches(figure, "ticks")
+    feet, tips = vertices(strokes).reshape(-1, 2, 2).swapaxes(0, 1)
+    assert feet[:, 0] == pytest.approx(1.0)
+    assert np.all(tips[:, 0] > feet[:, 0])
+    assert "forbidden side" in legend(figure)
+
+
+@pytest.mark.parametrize("own", ["outside", "expr"])
+def test_what_keeps_out_is_hatched_and_a_goal_is_not(own: str) -> None:
+    bar = cs.outside([0, 0], 1) if own == "outside" else cs.expr("a[0]**2 + a[1]**2 - 1")
+    figure = figures.formation(made(cs.Team([cs.Agent("a", [bar, cs.within([3, 0], 1)])]), np.array([[3.0, 0.0]])))
+    [keep_out] = patches(figure, "keep-out")
+    assert keep_out.get_hatch()
+    assert keep_out.get_path().contains_point((0, 0.5))
+    assert not keep_out.get_path().contains_point((3, 0))
+    [region] = shadings(figure)
+    assert region.get_path().contains_point((3, 0.5))
+    assert not region.get_path().contains_point((0, 0.5))
+    assert [text for text in legend(figure) if text.startswith("a: ")] == [f"a: {own}, keep out", "a: within"]
+
+
+def test_what_several_agents_share_is_drawn_once() -> None:
+    agents = [cs.Agent(f"a{i}", [cs.within([0, 0], 2), cs.outside([0, 0], 0.5)]) for i in range(4)]
+    end = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    figure = figures.formation(made(cs.Team(agents, links="line"), end))
+    assert [len(found) for found in (boundaries(figure), shadings(figure), patches(figure, "keep-out"))] == [2, 1, 1]
+    assert {"4 agents: within", "4 agents: outside, keep out"} <= set(legend(figure))
+
+
+def test_sides_of_a_box_have_one_name() -> None:
+    figure = figures.formation(made(cs.Team([cs.Agent("a", [*cs.box([0, 0], [1, 2])])]), np.array([[0.5, 0.5]])))
+    assert [text for text in legend(figure) if text.startswith("a: ")] == ["a: box"]
+    assert len(boundaries(figure)) == 4
+
+
+def test_axes_name_the_unit_of_the_scenario() -> None:
+    figure = figures.formation(made(cs.Team([cs.Agent("a", [cs.within([0, 0], 1)])], unit="m"), np.zeros((1, 2))))
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("position x [m]", "position y [m]")
+    assert figures.formation(made(tug(), GREETING)).axes[0].get_xlabel() == "position x"
 
 
 def test_regions_move_the_owner_and_nobody_else() -> None:
@@ -209,7 +248,8 @@ def test_paths_lead_from_open_starts_to_filled_ends() -> None:
     lines = figures.formation(result).axes[0].lines
     x = result.data["position"].values
     for i in range(3):
-        mine = [line for line in lines if line.get_color() == figures.colour(i) and line.get_linewidth() != 0.8]
+        mine = [line for line in lines if line.get_color() == figures.colour(i)]
+        mine.sort(key=lambda line: ["path", "start", "head"].index(line.get_gid()))
         path, start, end = (line.get_xydata() for line in mine)
         assert np.array_equal(path, x[:, i])
         assert np.array_equal(start, x[:1, i])
@@ -232,14 +272,71 @@ def test_names_of_agents_that_meet_do_not_cover_each_other() -> None:
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
+def named(figure: Figure, gid: str) -> list[Any]:
+    return [artist for artist in figure.axes[0].get_children() if artist.get_gid() == gid]
+
+
+def crowd(count: int, **keywords: Any) -> Result:
+    """Agents in a row, each in its region, the first five outside; around a keep-out that they share."""
+    agents = [cs.Agent(f"q{i}", [cs.within([i, 0], 1), cs.outside([count / 2, 4], 2)]) for i in range(count)]
+    end = np.stack([np.arange(float(count)), np.where(np.arange(count) < 5, 2.0, np.linspace(0, 0.8, count))], axis=1)
+    return made(cs.Team(agents, links="line"), end, samples=6, **keywords)
+
+
 def test_many_agents_are_coloured_by_margin() -> None:
-    team = cs.Team([cs.Agent(f"q{i}", [cs.within([i, 0], 1)]) for i in range(20)])
-    end = np.stack([np.arange(20.0), np.where(np.arange(20) < 5, 2.0, 0.0)], axis=1)
-    axes = figures.formation(made(team, end)).axes[0]
-    [heads] = [dots for dots in axes.collections if not isinstance(dots, QuadContourSet)]
+    result = crowd(20)
+    figure = figures.formation(result)
+    [heads] = named(figure, "head")
     red, _, blue, _ = heads.get_facecolor().T
-    assert np.array_equal(heads.get_offsets(), end)
+    assert np.array_equal(heads.get_offsets(), result.data["position"].values[-1])
     assert np.array_equal(red > blue, np.arange(20) < 5)
+    assert len(np.unique(heads.get_facecolor()[5:], axis=0)) >= 4  # the satisfied use the whole scale
+
+
+@pytest.mark.parametrize("margins", [[0.8, 0.9, 0.95, 1.0], [-5.0, -1.0, 0.5, 1e6], [-3.0, -2.0, -1.0, -1.0], [1.0] * 4, [np.inf] * 4])
+def test_scale_of_margins_splits_at_zero_and_is_used_as_a_whole(margins: list[float]) -> None:
+    values = np.array(margins)
+    palette, norm, edges, extend = colours.classes(values)
+    shades = palette(norm(np.ma.masked_invalid(values)))
+    assert 0.0 in edges
+    assert list(edges) == sorted(set(edges))
+    finite = np.isfinite(values)
+    assert np.array_equal(shades[finite, 0] > shades[finite, 2], values[finite] <= 0)
+    assert len(np.unique(shades[finite], axis=0)) == len(set(values[finite]))
+    assert extend == ("min" if not (values < 0).any() else "max" if not (values[finite] > 0).any() else "neither")
+    assert palette(norm(-1e9))[0] > palette(norm(-1e9))[2]  # whatever came before the end
+
+
+@pytest.mark.parametrize("count", [13, 50])
+def test_a_crowd_has_a_legend_regions_keep_outs_and_links_unlike_paths(count: int) -> None:
+    figure = figures.formation(crowd(count))
+    [union] = named(figure, "region")
+    assert union.get_path().contains_point((4, 0.5))
+    [discs] = [edges for edges in named(figure, "boundary") if isinstance(edges, EllipseCollection)]
+    assert len(discs.get_offsets()) == count
+    assert len(patches(figure, "keep-out")) == 1
+    [told] = figure.legends
+    assert [text.get_text() for text in told.get_texts()] == [
+        "agent",
+        "start and path",
+        "communication link",
+        "region to be in",
+        "keep-out",
+    ]
+    [links], [paths] = named(figure, "link"), named(figure, "path")
+    lightness = [np.dot([0.2126, 0.7152, 0.0722], np.array(to_rgb(line.get_color())) ** 2.2) for line in (links, paths)]
+    assert (max(lightness) + 0.05) / (min(lightness) + 0.05) > 4.5  # contrast, as WCAG counts it
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert 1 <= len(texts) <= 3
+    assert set(texts) <= {f"q{i}" for i in range(5)}
+
+
+def test_a_thousand_agents_are_drawn_quickly_and_nothing_is_cut_off() -> None:
+    figure = figures.formation(crowd(1000, copies=False))
+    renderer = drawn(figure)
+    used, (width, height) = figure.get_tightbbox(renderer), figure.get_size_inches()
+    assert (used.x0 > -0.02, used.y0 > -0.02, used.x1 < width + 0.02, used.y1 < height + 0.02) == (True,) * 4
+    assert len(figure.axes[0].get_children()) < 60
 
 
 def test_a_result_without_its_team_still_shows_its_paths() -> None:
@@ -322,13 +419,19 @@ def test_what_was_not_recorded_is_not_drawn(tmp_path: Path) -> None:
     assert [path.name for path in figures.save(result, tmp_path / "new")] == ["formation.png", "margins.png"]
 
 
-def test_of_very_many_copies_a_spread_of_them_is_drawn() -> None:
-    team = cs.Team([cs.Agent(f"q{i}", [cs.within([i, 0], 1)]) for i in range(30)], dimension=2)
-    figure = figures.estimates(made(team, np.zeros((30, 2)), samples=5))
+def test_of_many_copies_the_spread_is_drawn() -> None:
+    team = cs.Team([cs.Agent(f"q{i}", [cs.within([i, 0], 1)]) for i in range(30)], dimension=2, unit="m")
+    result = made(team, np.zeros((30, 2)), samples=5)
+    figure = figures.estimates(result)
     assert figure is not None
-    assert len(figure.axes[0].lines) == figures.MOST_CURVES
-    assert "600 of 900 copies" in figure.axes[0].get_title()
-    assert len(legend(figure)) < 25
+    axes = figure.axes[0]
+    wrong = np.linalg.norm(result.data["estimate"].values - result.data["position"].values[:, np.tile(np.arange(30), 30)], axis=2)
+    others = wrong[:, ~np.eye(30, dtype=bool).ravel()]
+    median, largest = axes.lines
+    assert median.get_ydata() == pytest.approx(np.median(others, axis=1))
+    assert largest.get_ydata() == pytest.approx(others.max(axis=1))
+    assert "870 copies" in axes.get_title()
+    assert axes.get_ylabel() == "distance of the estimate from the position [m]"
 
 
 # ---- the page
@@ -382,14 +485,28 @@ def test_names_are_shown_as_they_are_written() -> None:
 def test_beyond_three_dimensions_the_title_says_what_is_shown() -> None:
     axes = figures.formation(made(*PAGES["beyond"])).axes[0]
     assert "the first two of 5 axes" in axes.get_title()
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x1 [length]", "x2 [length]")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("position x1", "position x2")
 
 
-def test_balls_are_drawn_in_space() -> None:
-    axes: Any = figures.formation(made(*PAGES["space"])).axes[0]
-    [ball] = axes.collections
-    points = np.concatenate(ball._segments3d)
-    assert np.linalg.norm(points - [0, 1, 2], axis=1) == pytest.approx(1.0)
+def test_regions_keep_outs_and_boxes_are_drawn_in_space() -> None:
+    own = [cs.within([0, 1, 2], 1), cs.outside([4, 0, 0], 1.5), *cs.box([-3, -3, -1], [6, 3, 4])]
+    team = cs.Team([cs.Agent("a", own), cs.Agent("b", [cs.near("a", 1), cs.expr("4 - b[0]**2 - b[1]**2 - 2 * b[2]**2")])], dimension=3)
+    figure = figures.formation(made(team, np.ones((2, 3)), spread=1.0))
+    drawn(figure)
+    rings = [np.concatenate(lines._segments3d) for lines in named(figure, "boundary")]
+    within, outside, section, near = rings
+    for points, center, radius in ((within, [0, 1, 2], 1), (outside, [4, 0, 0], 1.5), (near, [1, 1, 1], 1)):
+        assert np.linalg.norm(points - center, axis=1) == pytest.approx(radius)
+    psi = 4 - section[:, 0] ** 2 - section[:, 1] ** 2 - 2 * section[:, 2] ** 2
+    assert np.abs(psi).max() < 0.1  # between grid points a section interpolates
+    solids = named(figure, "keep-out")
+    assert len(solids) == 1
+    faces = [np.asarray(face._faces) for face in named(figure, "region") if len(face._faces) == 1]
+    corners = np.unique(np.round(np.concatenate(faces).reshape(-1, 3), 9) + 0.0, axis=0)
+    assert corners.tolist() == [[x, y, z] for x in (-3, 6) for y in (-3, 3) for z in (-1, 4)]
+    assert named(figure, "shadow")
+    assert not any("`" in text for text in legend(figure))
+    assert {"a: within", "a: outside, keep out", "a: box", "b: near(a)", "b: expr"} <= set(legend(figure))
 
 
 def test_a_run_that_diverged_or_never_moved_can_be_looked_at() -> None:
@@ -451,14 +568,14 @@ def test_film_has_its_frames_its_size_and_its_length(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", ["crowd", "line", "space"])
 def test_every_kind_of_team_can_be_filmed(page: str, tmp_path: Path) -> None:
-    path = animation.save(made(*PAGES[page], clock="round", samples=4), tmp_path / "film.gif", seconds=0.5)
+    path = animation.save(made(*PAGES[page], clock="round", samples=4), tmp_path / "film.gif", seconds=0.7)
     with Image.open(path) as film:
         assert film.n_frames >= 6
 
 
-def test_film_is_a_gif() -> None:
-    with pytest.raises(InvalidSettings, match=r"film\.mp4 doesn't end in \.gif; write film\.gif"):
-        animation.save(made(tug(), GREETING), "film.mp4")
+def test_film_is_a_gif_or_a_video() -> None:
+    with pytest.raises(InvalidSettings, match=r"a film ends in \.gif or \.mp4, but film\.avi doesn't; write film\.gif"):
+        animation.save(made(tug(), GREETING), "film.avi")
 
 
 def test_scene_shows_what_is_between_samples() -> None:
@@ -466,19 +583,20 @@ def test_scene_shows_what_is_between_samples() -> None:
     shown = scene.Scene(result)
     shown.show(2.25)
     x = result.data["position"].values
-    heads = [line for line in shown.axes.lines if line.get_zorder() == 5]
+    heads = [line for line in shown.axes.lines if line.get_gid() == "head"]
     assert np.concatenate([line.get_xydata() for line in heads]) == pytest.approx(0.75 * x[2] + 0.25 * x[3])
     assert "round 2," in shown.axes.get_title()
-    edge = next(edge for edge in boundaries(shown.figure) if to_hex(edge.get_edgecolor()[0]) == figures.colour(1).lower())
+    edge = next(edge for edge in boundaries(shown.figure) if to_hex(edge.get_edgecolor()) == figures.colour(1).lower())
     assert np.linalg.norm(vertices(edge) - heads[0].get_xydata(), axis=1) == pytest.approx(3.0, abs=cell(shown.figure) ** 2)
 
 
 def test_scene_leaves_nothing_behind() -> None:
     shown = scene.Scene(made(tug(), GREETING))
     shown.show(0)
-    before = len(shown.axes.get_children())
-    shown.show(0)
+    before, moving = len(shown.axes.get_children()), list(shown.moving)
+    shown.show(5)
     assert len(shown.axes.get_children()) == before
+    assert shown.moving == moving  # the same artists, moved: to make them anew took most of the time of a film
 
 
 def test_film_dwells_on_what_moves() -> None:

@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import click
 
-from consat import __version__
+from consat.cli import completion
+from consat.cli.doctor import doctor, show_version
+from consat.cli.examples import add_examples
+from consat.cli.export import export, result_argument, show
 from consat.cli.keys import keys
 from consat.cli.network import agent, launch, split
 from consat.cli.terminal import (
@@ -74,7 +77,7 @@ def main() -> NoReturn:
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="consat")
+@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=show_version, help="Show the versions and the device.")
 def cli() -> None:
     """A team of robots that satisfies its private constraints together.
 
@@ -83,7 +86,7 @@ def cli() -> None:
 
 
 @cli.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=completion.scenarios)
 def init(name: str | None) -> None:
     """Write a scenario to begin with, to NAME.yaml.
 
@@ -115,10 +118,13 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 
 
 @cli.command()
-@click.argument("scenario", metavar="FILE", required=False)
+@click.argument("scenario", metavar="FILE", required=False, shell_complete=completion.scenarios)
 @set_option
 @click.option(
-    "--protocol", metavar="KIND", help="interior-point (default), max-min, admm, proximal, gradient-flow, proportional-integral, selfish."
+    "--protocol",
+    metavar="KIND",
+    shell_complete=completion.protocols,
+    help="interior-point (default), max-min, admm, proximal, gradient-flow, proportional-integral, selfish.",
 )
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
@@ -147,6 +153,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
     "--record",
     "agents",
     metavar="IDS",
+    shell_complete=completion.agents,
     callback=_names,
     help="Of whom to record: a1,a2, all or none; of large teams a sample, if not given.",
 )
@@ -272,7 +279,7 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 )
 @click.option("--seeds", type=click.IntRange(min=1), default=1, metavar="COUNT", help="How many seeds for each combination of values.")
 @click.option("--seed", type=click.IntRange(min=0), help="The first of them; start.seed if not given.")
-@click.option("--protocol", metavar="KIND", help="As for run, as is all that follows.")
+@click.option("--protocol", metavar="KIND", shell_complete=completion.protocols, help="As for run, as is all that follows.")
 @click.option("--estimates", type=click.Choice(["local", "full"]))
 @click.option("--rounds", type=click.IntRange(min=0))
 @click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS")
@@ -323,10 +330,11 @@ def sweep(
 
 
 @cli.command()
-@click.argument("result", type=click.Path(path_type=Path))
+@result_argument
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Where to; beside the result if not given.")
 def plot(result: Path, out: Path | None) -> None:
     """Draw the figures of a saved RESULT, a file or the DIR of a run."""
+    _cache_compilations()
     from consat.results.result import Result
 
     for path in Result.load(result).plot(out or _file(result).parent):
@@ -334,10 +342,12 @@ def plot(result: Path, out: Path | None) -> None:
 
 
 @cli.command()
-@click.argument("result", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="GIF", help="Where to; beside the result if not given.")
+@result_argument
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="FILM",
+              help="Where to, .gif or .mp4; a GIF beside the result if not given.")  # fmt: skip
 def animate(result: Path, out: Path | None) -> None:
-    """Make a GIF of a saved RESULT, a file or the DIR of a run."""
+    """Make a film of a saved RESULT, a file or the DIR of a run."""
+    _cache_compilations()
     from consat.results.result import Result
     from consat.views import animation
 
@@ -353,8 +363,9 @@ def _file(result: Path) -> Path:
     return result / RESULT if result.is_dir() else result
 
 
-for command in (split, agent, launch, keys):
+for command in (split, agent, launch, keys, export, show, doctor):
     cli.add_command(command)
+add_examples(cli)
 
 
 def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from consat.cli.completion import agents, protocols
 from consat.cli.terminal import (
     DONE,
     estimates_option,
@@ -29,7 +30,10 @@ if TYPE_CHECKING:
 MODES = ["interior-point", "admm", "link", "lockstep"]
 
 protocol_option = click.option(
-    "--protocol", metavar="KIND", help="For --mode lockstep: interior-point (default), max-min, admm, proximal; else as the mode is called."
+    "--protocol",
+    metavar="KIND",
+    shell_complete=protocols,
+    help="For --mode lockstep: interior-point (default), max-min, admm, proximal; else as the mode is called.",
 )
 port_option = click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Of the first agent.")
 mode_option = click.option(
@@ -130,7 +134,7 @@ def split(
 
 @click.command()
 @scenario_argument
-@click.option("--id", "agent", required=True, help="Which agent.")
+@click.option("--id", "agent", required=True, metavar="ID", shell_complete=agents, help="Which agent.")
 @set_option
 @mode_option
 @rate_option

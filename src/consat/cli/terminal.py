@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from consat.cli.completion import scenarios
 from consat.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
-scenario_argument = click.argument("scenario", metavar="FILE")
+scenario_argument = click.argument("scenario", metavar="FILE", shell_complete=scenarios)
 set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
 estimates_option = click.option(
     "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."

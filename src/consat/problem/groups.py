@@ -80,7 +80,7 @@ class Group:
 
     name: str
     count: int
-    constraints: Sequence[Any] = ()
+    constraints: Sequence[Constraint | Each | Sequence[Constraint]] = ()
     shape: str = "line"
     spacing: float = 1.0
     scatter: float | None = None

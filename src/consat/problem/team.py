@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.errors import Fault, InvalidTeam, closest, shown
-from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, flatten
+from consat.problem.constraints.record import OWNER, Constraint, Constraints, Fixed, Number, flatten
 from consat.problem.entries import SUGGESTIONS, Entry, alike, trace
 from consat.problem.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
 from consat.problem.groups import Expansion, Group, faults_of, stems_clash
@@ -27,6 +27,7 @@ MOST_NAMED = 100_000
 
 INSTANTS = 12
 """So many times tell where moving constraints lead, about."""
+LONGEST_UNIT = 16
 
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
 
@@ -44,7 +45,7 @@ class Agent:
     """
 
     id: str
-    constraints: Sequence[Any] = ()
+    constraints: Constraints = ()
     start: ArrayLike | None = None
 
 
@@ -56,6 +57,7 @@ class Team:
         links: who talks to whom: pairs of ids, a `networkx.Graph` over ids, an (L, 2) array of places in `ids`, or one of `TOPOLOGIES`
             (``task`` links agents along the task graph, the default).
         dimension: d ≥ 1.
+        unit: what lengths are measured in, such as ``m``, for figures and exports; if None, they name none.
 
     Raises:
         InvalidTeam: names every fault, its agent and constraint, and the cure.
@@ -71,6 +73,7 @@ class Team:
             it; NaN where nobody says. None if nobody says of anyone.
         members: the agents and groups as given; None if the constraints have been changed since.
         dimension: d.
+        unit: of lengths, or None.
     """
 
     ids: Sequence[str]
@@ -82,8 +85,9 @@ class Team:
     around: tuple[np.ndarray, np.ndarray] | None
     members: tuple[Agent | Group, ...] | None
     dimension: int
+    unit: str | None
 
-    def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2) -> None:
+    def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2, *, unit: str | None = None) -> None:
         self.members = tuple(agents)
         faults: list[Fault] = []
         if isinstance(dimension, bool) or not isinstance(dimension, int | np.integer) or not 1 <= dimension <= 64:
@@ -91,6 +95,10 @@ class Team:
             dimension = 0
         if not self.members:
             faults.append(Fault(("agents",), "a team needs at least one agent", "agents"))
+        if unit is not None and not (isinstance(unit, str) and unit.strip() and unit.isprintable() and len(unit) <= LONGEST_UNIT):
+            what = f"unit is {shown(unit)}, but must be a printable text of at most {LONGEST_UNIT} letters, such as m"
+            faults.append(Fault(("unit",), what, "unit"))
+        self.unit = unit
         self.dimension = int(dimension)
         index = Index(self.members, self.dimension, faults)
         self.ids = index.ids
@@ -238,6 +246,11 @@ class Team:
     def constraints_per_agent(self) -> np.ndarray:
         """(N,) m_i."""
         return np.bincount(self.owner, minlength=self.count)
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.team(self)
 
     def __repr__(self) -> str:
         return f"Team({self.count} agents, {len(self.owner)} constraints, {len(self.links)} links, dimension={self.dimension})"

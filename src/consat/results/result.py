@@ -7,13 +7,14 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from consat.errors import InvalidResult
 from consat.problem.team import Team
 from consat.results.netcdf import FINAL, SCHEMA, UNITS, VARIABLES, axis_names
+from consat.results.summaries import RunSummary
 from consat.results.trace import Trace
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Result:
 
     def __init__(self, summary: Mapping[str, Any], data: xr.Dataset | None = None, *, trace: Trace | None = None, team: Team | None = None,
                  scenario: str | None = None) -> None:  # fmt: skip
-        self.summary = dict(summary)
+        self.summary = cast(RunSummary, dict(summary))
         self.scenario = scenario
         self._data = data
         self._trace = trace
@@ -109,10 +110,22 @@ class Result:
         return figures.save(self, directory) if directory is not None else figures.show(self)
 
     def animate(self, path: str | os.PathLike[str]) -> Path:
-        """The run as an animated GIF; see `consat.views.animation`."""
+        """The run as an animated GIF, or an MP4 video; see `consat.views.animation`."""
         from consat.views import animation
 
         return animation.save(self, path)
+
+    def html(self, path: str | os.PathLike[str]) -> Path:
+        """The run as one HTML file that replays it offline; see `consat.views.replay`."""
+        from consat.views import replay
+
+        return replay.save(self, path)
+
+    def export(self, path: str | os.PathLike[str]) -> Path:
+        """The run as a file of another kind, which the ending says: .csv, .gif, .html, .mcap, .mp4; see `consat.views.export`."""
+        from consat.views import export
+
+        return export.save(self, path)
 
     def __str__(self) -> str:
         from consat.views import words
@@ -130,6 +143,11 @@ class Result:
         from consat.certify.reasons import explain
 
         return explain(team, max_min(team))
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.result(self)
 
     def __repr__(self) -> str:
         return f"<Result of {self.summary['scenario']}: {self.summary['status']}, margin {self.summary['margin']}>"

@@ -27,7 +27,7 @@ from consat.engine.rounds import Tally, known_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam, closest, shown
 from consat.numerics import float64
 from consat.problem.constraints.library import ADJUSTABLE, adjustable
-from consat.problem.constraints.record import Number, Vector
+from consat.problem.constraints.record import Number, Vector, flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import checked, still, vector
@@ -271,12 +271,12 @@ class Session:
         given = None if links is None else [links] if isinstance(links, str) else list(links)
         joined = [*team.agents, agent]
         ends = [(agent.id, other) for other in given or ()]
-        new = Team(joined, [*team.linked, *ends], team.dimension)
+        new = _like(team, joined, ends)
         if given is None:
             i = new.count - 1
             read = {int(j) for family in new.families for j in np.unique(family.agents[family.owner == i])} - {i}
             ends = [(agent.id, new.ids[j]) for j in sorted(read)]
-            new = Team(joined, [*team.linked, *ends], team.dimension)
+            new = _like(team, joined, ends)
         if agent.start is None and (near := [other for _, other in ends if other in known]):
             middle = np.mean([self._positions[self._place_of(other)] for other in near], axis=0)
             new.starts[-1] = middle
@@ -341,8 +341,8 @@ class Session:
         """
         i, team = self._place_of(agent), self.team
         agents = list(team.agents)
-        agents[i] = dataclasses.replace(agents[i], constraints=[*agents[i].constraints, constraint])
-        self._restructure(Team(agents, team.linked, team.dimension))
+        agents[i] = dataclasses.replace(agents[i], constraints=[*flatten(agents[i].constraints), constraint])
+        self._restructure(_like(team, agents))
         return self
 
     @float64
@@ -356,8 +356,8 @@ class Session:
         team, i = self.team, self._place_of(agent)
         gone = {team.names[number] for number in numbers}
         agents = list(team.agents)
-        agents[i] = dataclasses.replace(agents[i], constraints=[each for each in agents[i].constraints if each.name not in gone])
-        self._restructure(Team(agents, team.linked, team.dimension))
+        agents[i] = dataclasses.replace(agents[i], constraints=[each for each in flatten(agents[i].constraints) if each.name not in gone])
+        self._restructure(_like(team, agents))
         return self
 
     # ---- looking ------------------------------------------------------------------------------------------------------------------------
@@ -575,6 +575,11 @@ class Session:
         self._state = self._state._replace(state=inner._replace(memory=memory))
 
 
+def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:
+    """A team with other agents, and with more links."""
+    return Team(agents, [*team.linked, *links], team.dimension, unit=team.unit)
+
+
 _WEIGHT = Number(None, positive=True)
 
 
@@ -584,13 +589,13 @@ def _with_parameters(team: Team, changes: Sequence[tuple[int, Mapping[str, Any]]
     start = np.searchsorted(team.owner, team.owner)
     for number, given in changes:
         i = int(team.owner[number])
-        own = list(agents[i].constraints)
+        own = list(flatten(agents[i].constraints))
         k = number - int(start[number])
         old = own[k]
         parameters = {key: dataclasses.replace(each, value=given[key]) if key in given else each for key, each in old.parameters.items()}
         own[k] = dataclasses.replace(old, parameters=parameters, weight=float(given.get("weight", old.weight)))
         agents[i] = dataclasses.replace(agents[i], constraints=own)
-    return Team(agents, team.linked, team.dimension)
+    return _like(team, agents)
 
 
 @jax.jit

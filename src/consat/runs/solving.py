@@ -12,6 +12,7 @@ from consat.certify.certificate import BINDING, bounds
 from consat.numerics import float64
 from consat.problem.team import Team
 from consat.problem.units import scale
+from consat.results.summaries import Verdict
 from consat.runs.preparation import scenario_of, with_auxiliary
 from consat.runs.summary import number
 from consat.scenario import Scenario
@@ -21,8 +22,53 @@ PROVEN = 1e-6
 """A margin that is proven to be so near the best possible, in the team's unit of ψ, is the best possible."""
 
 
+class Solution(dict[str, Any]):
+    """What ``consat solve --json`` prints (schema consat.solve/1), with its main entries as attributes.
+
+    Attributes:
+        team: that was solved; None if it is not known.
+    """
+
+    team: Team | None = None
+
+    @property
+    def margin(self) -> float | None:
+        """The best margin that was found; None if it is unbounded."""
+        margin: float | None = self["margin"]
+        return margin
+
+    @property
+    def bounds(self) -> tuple[float | None, float | None]:
+        """Between what the best possible margin lies, proven; None where nothing is."""
+        lower, upper = self["bounds"]
+        return lower, upper
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the constraints can all hold."""
+        verdict: Verdict = self["verdict"]
+        return verdict
+
+    @property
+    def positions(self) -> dict[str, list[float | None]]:
+        """Where everybody stands, by id."""
+        positions: dict[str, list[float | None]] = self["positions"]
+        return positions
+
+    @property
+    def reasons(self) -> list[str]:
+        """What binds or conflicts, in words."""
+        reasons: list[str] = self["reasons"]
+        return reasons
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.solution(self, self.team)
+
+
 @float64
-def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> dict[str, Any]:
+def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> Solution:
     """Find the best margin that any formation can have, centrally, with a certificate; see `consat.certify.optimum.max_min`.
 
     Args:
@@ -45,7 +91,7 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
     certificate = bounds(problem, optimum.positions, multipliers=optimum.multipliers)
     proven = certificate.upper is not None and certificate.upper - optimum.margin <= PROVEN * scale(problem).psi
     optimum = dataclasses.replace(optimum, exact=optimum.exact or proven)
-    return {
+    solution = Solution({
         "schema": SCHEMA,
         "scenario": scenario.name,
         "margin": number(optimum.margin),
@@ -61,7 +107,9 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
         "method": optimum.method,
         "auxiliary": None if auxiliary is None else _auxiliary(problem, auxiliary, optimum.multipliers),
         "reasons": explain(problem, optimum),
-    }
+    })  # fmt: skip
+    solution.team = problem
+    return solution
 
 
 def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:

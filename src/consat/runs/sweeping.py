@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
+from consat.results.summaries import SweepSummary
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
 from consat.runs.runner import run
@@ -53,7 +54,7 @@ class Sweep:
     """
 
     def __init__(self, summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> None:
-        self.summary = dict(summary)
+        self.summary = cast(SweepSummary, dict(summary))
         self.runs = list(runs)
 
     def save(self, directory: str | os.PathLike[str]) -> list[Path]:
@@ -77,6 +78,11 @@ class Sweep:
         from consat.views import words
 
         return words.sweep(self.summary)
+
+    def _repr_html_(self) -> str:
+        from consat.views import notebook
+
+        return notebook.sweep(self.summary, self.runs)
 
 
 def values(text: str) -> list[Any]:
@@ -293,7 +299,7 @@ class _Asked:
                 agents="none",
                 record=False,
             )
-            told = result.summary
+            told: Mapping[str, Any] = {**result.summary}
             since = told["satisfied_from"]["round"] if told["rounds"] is not None else told["satisfied_from"]["time"]
             satisfied += told["status"] == "satisfied"
             progress((k + 1) / total, satisfied / (k + 1))

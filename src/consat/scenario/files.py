@@ -53,14 +53,14 @@ def load(source: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scena
     """Read a scenario.
 
     Args:
-        source: the path of a file, or a packaged name such as ``case-b``; a path that exists wins.
+        source: the path of a file, or a packaged name such as ``case-b``; a file of that name wins.
         overrides: ``path=value`` strings, e.g. ``start.box=[-9, 9]`` or ``agents.a1.constraints.0.radius=2``.
 
     Raises:
         InvalidScenario: names every fault with its line and column.
     """
     file = os.fspath(source)
-    text = packaged_text(file) if file in packaged() and not Path(file).exists() else _text(file)
+    text = packaged_text(file) if file in packaged() and not Path(file).is_file() else _text(file)
     return loads(text, file, overrides)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
-KEYS: Final = ("consat", "name", "dimension", "count", "agents", "communication", "robots", "obstacles", "rate", *SETTINGS)
+KEYS: Final = ("consat", "name", "dimension", "unit", "count", "agents", "communication", "robots", "obstacles", "rate", *SETTINGS)
 AGENT_KEYS: Final = ("id", "start", "robot", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
@@ -96,7 +96,7 @@ def build(document: Document) -> Built:
     robots, rate = _robots(data, dimension, faults), _rate(data.get("rate"), faults)
     team = None
     try:
-        team = Team(agents, links, dimension)
+        team = Team(agents, links, dimension, unit=data.get("unit"))
     except InvalidTeam as error:
         faults.take(error.faults)
     if faults.found or document.faults or team is None:

@@ -70,7 +70,7 @@ def dump(
             agent["robot"] = own[agent["id"]]
     about = {key: machines[key] for key in ("robots", "obstacles") if machines.get(key)} | ({} if rate is None else {"rate": rate})
     chosen = (settings or Settings()).model_dump(mode="json", by_alias=True, exclude_defaults=True, include=set(SETTINGS))
-    head = {"consat": VERSION, "name": name, "dimension": team.dimension} | count
+    head = {"consat": VERSION, "name": name, "dimension": team.dimension} | ({} if team.unit is None else {"unit": team.unit}) | count
     return write(head | {"agents": agents, "communication": _communication(team)} | about | chosen)
 
 

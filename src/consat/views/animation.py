@@ -1,43 +1,68 @@
-"""The formation in motion, as an animated GIF."""
+"""The formation in motion, as an animated GIF or an MP4 video."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection
 from PIL import Image
 
 from consat.errors import InvalidSettings
 from consat.results.result import Result
 from consat.views.scene import Scene, moments
 
-MOVEMENT = 0.75  # share of a film that goes by the way travelled, the rest by the clock: most happens in the first seconds
+MOVEMENT: Final = 0.75
+"""Share of a film that goes by the way travelled, the rest by the clock: most happens in the first seconds."""
+FINE: Final = 121
+"""Points along each side of the view at which ψ is evaluated, in a film."""
+FORMATS: Final = (".gif", ".mp4")
+SAMPLES: Final = 24
+"""Frames from which the colours of a GIF are chosen."""
 
 
 def save(
-    result: Result, path: str | os.PathLike[str], seconds: float = 8.0, fps: int = 15, *, progress: Callable[[float], None] | None = None
+    result: Result, path: str | os.PathLike[str], seconds: float = 8.0, fps: int = 10, *, progress: Callable[[float], None] | None = None
 ) -> Path:
-    """Write the formation in motion as an animated GIF.
+    """Write the formation in motion.
 
     Args:
         result: of a run.
-        path: must end in ``.gif``.
+        path: ends in ``.gif``, or in ``.mp4``, which needs PyAV (``consat[video]``).
         seconds: how long the film lasts, s; 10 % of it shows the end.
         fps: frames a second.
         progress: called with the share that is done, 0 to 1.
 
     Raises:
-        InvalidSettings: another ending.
+        InvalidSettings: another ending, nobody was recorded, or PyAV is not installed.
     """
     target = Path(path)
-    if target.suffix.lower() != ".gif":
-        raise InvalidSettings(f"the animation is an animated GIF, but {target} doesn't end in .gif; write {target.with_suffix('.gif')}")
+    suffix = target.suffix.lower()
+    if suffix not in FORMATS:
+        raise InvalidSettings(f"a film ends in {' or '.join(FORMATS)}, but {target} doesn't; write {target.with_suffix('.gif')}")
+    if "position" not in result.data:
+        raise InvalidSettings("nobody's positions were recorded, so there is nothing to show; run with --record all")
+    if suffix == ".mp4":
+        _encoder()
     target.parent.mkdir(parents=True, exist_ok=True)
-    scene = Scene(result)
+    count = max(2, round(seconds * fps))
+    shown = frames(result, count, progress)
+    if suffix == ".mp4":
+        _mp4(target, shown, fps)
+    else:
+        _gif(target, list(shown), fps)
+    return target
+
+
+def frames(result: Result, count: int, progress: Callable[[float], None] | None = None) -> Iterator[np.ndarray]:
+    """The frames of a film, (height, width, 3) uint8; what doesn't move is drawn once."""
+    scene = Scene(result, fine=FINE)
     scene.figure.set_dpi(90)
     canvas = FigureCanvasAgg(scene.figure)
     scene.show(scene.last)
@@ -48,23 +73,65 @@ def save(
         artist.set_visible(False)
     canvas.draw()
     background = canvas.copy_from_bbox(scene.figure.bbox)
-    count = max(2, round(seconds * fps))
+    for artist in scene.moving:
+        artist.set_visible(True)
     moving = moments(scene, count - count // 10, MOVEMENT if scene.x.shape[2] > 1 else 0.0)
-    frames = []
     for k, moment in enumerate(np.pad(moving, (0, count // 10), "edge")):
-        scene.show(moment)
-        if scene.x.shape[2] == 3:
-            canvas.draw()
-        else:
+        if k < len(moving):
+            scene.show(moment)
             canvas.restore_region(background)
             for artist in sorted([*scene.moving, scene.axes.title], key=Artist.get_zorder):
+                if isinstance(artist, Collection) and scene.x.shape[2] == 3:
+                    artist.do_3d_projection()  # type: ignore[attr-defined]
                 scene.axes.draw_artist(artist)
-        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+            picture = np.array(canvas.buffer_rgba())[:, :, :3]
+        yield picture
         if progress is not None:
             progress((k + 1) / count)
-    palette = frames[-1].quantize(256)
-    palette.putpalette([255 if level > 245 else level for level in palette.getpalette() or ()])  # white stays white
-    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    ends = np.round(np.arange(count + 1) * 100 / fps)  # a GIF counts in 10 ms
-    first.save(target, save_all=True, append_images=others, duration=(10 * np.diff(ends)).astype(int).tolist(), loop=0)
-    return target
+
+
+def _gif(target: Path, shown: Sequence[np.ndarray], fps: int) -> None:
+    """One palette for all frames, and a table from a colour's first five bits a channel to its place there."""
+    some = [shown[k] for k in np.unique(np.linspace(0, len(shown) - 1, SAMPLES).astype(int))]
+    palette = Image.fromarray(np.concatenate([each[::2, ::2] for each in some])).quantize(255)
+    colours = np.array(palette.getpalette(), dtype=np.uint8).reshape(-1, 3)[:255]
+    colours[colours.min(axis=1) > 245] = 255  # white stays white
+    palette.putpalette(colours.tobytes())
+    bits = np.arange(32, dtype=np.uint8) * 8
+    every = np.stack(np.meshgrid(bits, bits, bits, indexing="ij"), axis=-1).reshape(1, -1, 3)
+    every = np.where(every == 248, 255, every + 4 * (every > 0))
+    table = np.asarray(Image.fromarray(every.astype(np.uint8)).quantize(palette=palette, dither=Image.Dither.NONE)).ravel()
+    pictures = []
+    for frame in shown:
+        short = frame.astype(np.uint16) >> 3
+        picture = Image.fromarray(table[short[..., 0] << 10 | short[..., 1] << 5 | short[..., 2]], "P")
+        picture.putpalette(colours.tobytes())
+        pictures.append(picture)
+    ends = np.round(np.arange(len(shown) + 1) * 100 / fps)  # a GIF counts in 10 ms
+    durations = (10 * np.diff(ends)).astype(int).tolist()
+    pictures[0].save(target, save_all=True, append_images=pictures[1:], duration=durations, loop=0)
+
+
+def _encoder() -> None:
+    """Raises: InvalidSettings: there is no encoder."""
+    from importlib.util import find_spec
+
+    if find_spec("av") is None:
+        raise InvalidSettings("an MP4 needs PyAV; install it with: pip install 'consat[video]' (a GIF needs nothing)")
+
+
+def _mp4(target: Path, shown: Iterator[np.ndarray], fps: int) -> None:
+    """H.264, which every browser and player shows."""
+    import av
+
+    with av.open(str(target), "w") as film:
+        stream = None
+        for picture in shown:
+            height, width = (side - side % 2 for side in picture.shape[:2])  # the format has even sides only
+            if stream is None:
+                stream = film.add_stream("libx264", rate=Fraction(fps), options={"crf": "18"})
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format="rgb24")
+            film.mux(stream.encode(frame))
+        if stream is not None:
+            film.mux(stream.encode())

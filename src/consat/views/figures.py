@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from jax import Array
@@ -25,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from consat.numerics import float64
+from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.results.result import Result
 
@@ -42,7 +42,9 @@ FAR = 6.0
 """Paths that would make the view this many times wider are cut, so that the formation stays visible."""
 MOST_NUMBERS = 10_000_000
 """Of a longer record some steps are drawn, evenly spread."""
-MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 1200, 12, 60
+MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 120, 12, 60
+MOST_HELD = 12
+"""Of copies held by, or of, more agents than this their spread is drawn; likewise where they would be more than `MOST_CURVES` curves."""
 
 
 def colour(agent: int) -> str:
@@ -61,7 +63,7 @@ def plain(text: str, longest: int = 34) -> str:
 
 
 @functools.partial(jax.jit, static_argnames="psi")
-def _over(psi: Callable[..., Any], points: Array, arguments: Array, slot: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
+def _over(psi: Callable[..., Any], points: Any, arguments: Any, slot: Any, parameters: Mapping[str, Any], weight: Any) -> Array:
     def at(point: Array, arguments: Array, slot: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
         return weight * psi(*arguments.at[slot, : len(point)].set(point), **parameters)
 
@@ -69,27 +71,28 @@ def _over(psi: Callable[..., Any], points: Array, arguments: Array, slot: Array,
 
 
 @float64
-def regions(team: Team, x: np.ndarray, points: np.ndarray) -> np.ndarray:
+def regions(team: Team, x: np.ndarray, points: np.ndarray, families: Sequence[Family] | None = None) -> np.ndarray:
     """How well each constraint holds for its owner at other places, as the others stand.
 
     Args:
         team: the team.
         x: (N, d) everyone's positions.
         points: (K, p) where to put the owner instead, on its first p ≤ d axes.
+        families: of which constraints, if not all.
 
     Returns:
-        (M, K) the weighted ψ of every constraint, in the team's order; NaN where it is not finite.
+        (M, K) the weighted ψ of every constraint, in the team's order; NaN where it is not finite, and for those that were not asked for.
     """
     count = len(points)
     batches = np.resize(points, (-(-count // BATCH), BATCH, points.shape[1]))  # all of one size, so that ψ is compiled once
-    values = np.empty((len(team.owner), batches.shape[0] * BATCH))
-    for family in team.families:
-        slot = jnp.asarray(np.argmax(family.agents == family.owner[:, None], axis=1))
-        parameters = {key: jnp.asarray(value) for key, value in family.parameters.items()}
-        arguments, weight = jnp.asarray(x[family.agents], dtype=float), jnp.asarray(family.weight)
+    values = np.full((len(team.owner), batches.shape[0] * BATCH), np.nan)
+    for family in team.families if families is None else families:
+        slot = np.argmax(family.agents == family.owner[:, None], axis=1)
+        parameters = {key: np.asarray(value) for key, value in family.parameters.items()}
+        arguments, weight = np.asarray(x[family.agents], dtype=float), np.asarray(family.weight, dtype=float)
         for k, batch in enumerate(batches):
             at = slice(k * BATCH, (k + 1) * BATCH)
-            values[family.number, at] = _over(family.psi, jnp.asarray(batch), arguments, slot, parameters, weight)
+            values[family.number, at] = _over(family.psi, batch, arguments, slot, parameters, weight)
     return np.where(np.isfinite(values), values, np.nan)[:, :count]
 
 
@@ -110,10 +113,11 @@ def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ite
                 yield k, np.take_along_axis(along, ends.T, axis=1).T
 
 
-def view(paths: np.ndarray, x: np.ndarray, team: Team | None) -> tuple[np.ndarray, np.ndarray, bool]:
+def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, bool]:
     """The box to show, low and high, of the paths (T, N, p) to a formation at x (N, d), and whether it leaves starts out.
 
-    It holds the formation, its regions, and the paths unless they come from far.
+    It holds the formation, its regions, and the paths unless they come from far. Where `team` is None, the regions are those within
+    `boxes` (B, 2, p).
     """
     everywhere, core = paths.reshape(-1, paths.shape[2]), paths[-1]
     middle = (core.min(axis=0) + core.max(axis=0)) / 2
@@ -125,11 +129,15 @@ def view(paths: np.ndarray, x: np.ndarray, team: Team | None) -> tuple[np.ndarra
             if k in missing and (len(missing) == count or np.ptp(box, axis=0).max() <= FAR * np.ptp(core, axis=0).max()):
                 core = np.concatenate([core, box])
                 missing.discard(k)
+    for box in () if boxes is None else boxes:
+        if np.ptp(np.concatenate([core, box]), axis=0).max() <= FAR * max(np.ptp(paths[-1], axis=0).max(), np.ptp(box, axis=0).max()):
+            core = np.concatenate([core, box])
     both = np.concatenate([core, everywhere])
     cut = bool(np.ptp(both, axis=0).max() > FAR * np.ptp(core, axis=0).max() > 0)
     low, high = (core if cut else both).min(axis=0), (core if cut else both).max(axis=0)
     side = float((high - low).max()) or 1.0
-    spare = np.maximum(0.0, 0.75 * side - (high - low)) / 2 + (0.35 if cut else 0.08) * side
+    least = 0.75 if len(low) < 3 else 0.5  # of the longest side of the view, the others
+    spare = np.maximum(0.0, least * side - (high - low)) / 2 + (0.35 if cut else 0.08) * side
     return low - spare, high + spare, cut
 
 
@@ -183,7 +191,7 @@ def margins(result: Result) -> Figure:
     if lower is not None and upper is not None:
         proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
         axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
-    since = (summary.get("satisfied_from") or {}).get(clock)
+    since = summary["satisfied_from"]["time" if clock == "time" else "round"]
     if since is not None:
         axes.axvline(since, color=COLOURS[3], linewidth=1.5, linestyle=":")
         label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
@@ -223,18 +231,25 @@ def _stretch(axes: Axes, *curves: np.ndarray) -> None:
     axes.set_ylim(limits)
 
 
+def label(what: str, unit: str | None) -> str:
+    """The label of an axis: what it shows, with the unit if one is given."""
+    return what if unit is None else f"{what} [{plain(unit)}]"
+
+
 def number(value: float) -> str:
     """A number for people: three digits, or the whole ones of thousands, and a real minus."""
     return (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
 
 
 def estimates(result: Result) -> Figure | None:
-    """What the agents think where everyone is: a colour for each coordinate, a line style for each holder; None if it was not recorded."""
-    return _copies(result, "estimate", "estimates of the positions", "estimate [length]")
+    """What the agents think where everyone is: a colour for each coordinate, a line style for each holder; of many, how wrong they are.
+    None if it was not recorded."""
+    unit = None if result.team is None else result.team.unit
+    return _copies(result, "estimate", "estimates of the positions", label("estimate", unit))
 
 
 def integrals(result: Result) -> Figure | None:
-    """The integral states, encoded as the estimates; None if they were not recorded."""
+    """The integral states, encoded as the estimates; of many, how large they are. None if they were not recorded."""
     return _copies(result, "integral", "integral states", "integral state z")
 
 
@@ -242,13 +257,16 @@ def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None
     data = recorded(result)
     if name not in data:
         return None
-    ids, names = ([str(value) for value in data[key].values] for key in ("agent", "axis"))
+    ids = [str(value) for value in data["agent"].values] if "agent" in data.coords else []
+    curves = data[name].shape[1] * data[name].shape[2]
+    if len(ids) > MOST_HELD or curves > MOST_CURVES or not {str(value) for value in data["held"].values} <= set(ids):
+        return _spread(result, data, name, title)
+    names = [str(value) for value in data["axis"].values]
     index = {agent: i for i, agent in enumerate(ids)}
     count, dimension = data[name].shape[1:]
     shades = _shades(len(ids), dimension)
-    chosen = _sample(count, max(1, MOST_CURVES // dimension))
-    figure, axes, clock = _chart(result, title + (f", {len(chosen)} of {count} copies" if len(chosen) < count else ""), ylabel)
-    for copy in chosen:
+    figure, axes, clock = _chart(result, title, ylabel)
+    for copy in range(count):
         holder, held = (index[str(data[key].values[copy])] for key in ("holder", "held"))
         for values, shade in zip(data[name].values[:, copy].T, shades[held], strict=True):
             axes.plot(data[clock], values, color=shade, linestyle=STYLES[holder % len(STYLES)], linewidth=1.3)
@@ -261,6 +279,34 @@ def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None
     if len(ids) > len(STYLES):
         entries.append(Line2D([], [], linestyle="", label="… and so on, in turn"))
     axes.legend(handles=entries, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, borderaxespad=0)
+    return figure
+
+
+def _spread(result: Result, data: xr.Dataset, name: str, title: str) -> Figure:
+    """Of many copies how large they are, or of estimates how wrong, as bands over all copies."""
+    values, what, unit = data[name].values, f"size of the {title}", None
+    ids = {str(agent): i for i, agent in enumerate(data["agent"].values)} if "agent" in data.coords else {}
+    known = [copy for copy, held in enumerate(data["held"].values) if str(held) in ids]
+    if name == "estimate" and known:
+        team = result.team
+        what, unit = "distance of the estimate from the position", None if team is None else team.unit
+        place = [ids[str(data["held"].values[copy])] for copy in known]
+        of_others = data["holder"].values != data["held"].values  # nobody errs about oneself
+        others = [j for j, copy in enumerate(known) if of_others[copy]]
+        values = (values[:, known] - data["position"].values[:, place])[:, others or slice(None)]
+    sizes = np.linalg.norm(values, axis=2)
+    count = sizes.shape[1]
+    figure, axes, clock = _chart(result, f"{title}, {count:,} copies", label(what, unit))
+    low, first, middle, third, high = np.quantile(np.nan_to_num(sizes, nan=0.0, posinf=0.0), [0.0, 0.25, 0.5, 0.75, 1.0], axis=1)
+    floor = 1e-3 * float(middle.max(initial=0.0)) or 1e-12
+    axes.fill_between(data[clock], low, high, color=COLOURS[0], alpha=0.13, linewidth=0, label="all copies")
+    axes.fill_between(data[clock], first, third, color=COLOURS[0], alpha=0.35, linewidth=0, label="the middle half")
+    axes.plot(data[clock], middle, color=COLOURS[0], linewidth=1.8, label="median")
+    axes.plot(data[clock], high, color=COLOURS[1], linewidth=1.0, linestyle="--", label="largest")
+    if high.max() > 100 * max(high[-1], floor):
+        axes.set_yscale("symlog", linthresh=floor)
+    axes.set_ylim(bottom=0.0)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

@@ -10,18 +10,28 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import CenteredNorm
-from matplotlib.contour import QuadContourSet
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, PathPatch
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
-from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views.figures import GREY, STYLES, colour, grid, marker, number, plain, recorded, regions, view
+from consat.views import areas, space
+from consat.views.areas import SHARED, Area, Ground
+from consat.views.colours import AREA, LINK, TRAIL, classes
+from consat.views.figures import GREY, colour, grid, label, marker, number, plain, recorded, regions, view
+from consat.views.shapes import Shapes, boxes, moves, shapes
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
-GRID = 241  # points along each side of the view at which ψ is evaluated
+MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
+"""Of a crowd: constraints of which regions are drawn at all, keep-outs that are hatched, walls, other ψ, regions that have edges."""
+GRID = 241
+"""Points along each side of the view at which ψ is evaluated."""
+DOTS: Any = (0, (1, 1.5))
+MOST_TIGHTEST, MOST_ASKED = 3, 20
+"""Of a crowd so many of the worst violated agents have their names written, where there is room."""
 
 
 def _directions(points: np.ndarray, lengths: Sequence[int]) -> list[np.ndarray]:
@@ -40,37 +50,55 @@ def _directions(points: np.ndarray, lengths: Sequence[int]) -> list[np.ndarray]:
 
 
 class Scene:
-    """The formation of a result on axes, drawn anew at every `show`; a still is the last moment of a film.
+    """The formation of a result on axes; every `show` moves what is drawn, so a still is the last moment of a film.
 
     In 1-D against time, beyond 3-D on the first two axes. A moment is a sample, or lies between two.
 
+    Args:
+        result: of a run.
+        axes: what to draw on; if None, those of a new figure.
+        fine: points along each side of the view at which ψ is evaluated.
+
     Attributes:
         axes, figure: what it is drawn on.
-        moving: what the last `show` drew.
+        moving: what `show` changes.
         x: (T, N, d) positions.
         steps: (T,) times in s, or rounds.
         last: the last sample at which every position is finite.
     """
 
-    def __init__(self, result: Result, axes: Any = None) -> None:
+    def __init__(self, result: Result, axes: Any = None, fine: int = GRID) -> None:
         data, team = recorded(result), None if "final_position" in result.data else result.team  # regions need everybody
         self.x, self._clock = data["position"].values, str(data["position"].dims[0])
         self.steps, self._margin, self._agent_margin = (data[name].values for name in (self._clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
         self.last = int(finite[-1]) if len(finite) else 0
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
-        self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values if self._few]
+        self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
-        self._team = team if self._few and team is not None and len(team.owner) else None
+        self._fine, self._team = fine, team if team is not None and 0 < len(team.owner) <= MOST_SHAPES else None
         self._links = team.links if team is not None and len(team.links) <= MOST_LINES else np.zeros((0, 2), dtype=int)
         self._line, self._space = self.x.shape[2] == 1, self.x.shape[2] == 3
+        own = axes is None
         self.axes: Any = axes or Figure(layout="compressed").add_subplot(projection="3d" if self._space else None)
         self.figure = cast(Any, self.axes.get_figure())
         self.moving: list[Artist] = []
-        ratio = self._frame([str(name) for name in data["axis"].values])
-        rows, letters = self._legend() if self._few else self._colour_bar()
-        if axes is None:
-            self.figure.set_size_inches(1.5 + 4.4 * ratio + 0.075 * letters, max(5.2, 0.5 + 0.21 * rows))
+        self._areas: list[Area] = []
+        self._ground: Ground | None = None
+        self._shapes: Shapes | None = None
+        if self._team is not None and (self._space or not self._few):
+            self._shapes = shapes(self._team)
+        ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
+        rows, letters = self._legend() if self._few else self._crowd_legend(own)
+        if own:
+            height = max(5.2, 0.6 + 0.235 * rows)  # at low resolutions letters are taller
+            self.figure.set_size_inches(1.5 + (height - 0.8) * ratio + 0.08 * letters, height + 0.6 * (not self._few))
+        if self._space:
+            list(self._bodies(self.x[self.last], moving=False))
+        else:
+            self._cast()
+
+    # ---- what stays
 
     def _trail(self, moment: float) -> np.ndarray:
         """(K, N, 2 or 3) where the agents are drawn until a moment."""
@@ -78,123 +106,314 @@ class Scene:
         x = _between(self.x, moments)[:, :, : 3 if self._space else 2]
         return np.concatenate([np.broadcast_to(_between(self.steps, moments)[:, None, None], x.shape), x], axis=2) if self._line else x
 
-    def _frame(self, names: Sequence[str]) -> float:
-        """Limits and labels; returns how wide the axes should be for their height."""
-        axes, team = self.axes, self._team
-        low, high, self._cut = view(self.x[: self.last + 1, :, : 3 if self._space else 2], self.x[self.last], team)
-        self._along, self._points = grid(low, high, 2 if self._space else GRID)
-        labels = [f"{name} [length]" for name in names]
+    def _frame(self, names: Sequence[str], unit: str | None) -> float:
+        """Limits, labels and regions; returns how wide the axes should be for their height."""
+        axes, team, x = self.axes, self._team, self.x[self.last]
+        axis_count = 3 if self._space else 2
+        low, high, self._cut = view(self.x[: self.last + 1, :, :axis_count], x, team if self._few else None, self._boxes(x, axis_count))
+        self._along, self._points = grid(low, high, 2 if self._space else self._fine)
+        labels = [label(f"position {name}", unit) for name in names]
         if self._line:
             until = float(self.steps[self.last]) or 1.0
             low, high = np.array([-0.03 * until, low[0]]), np.array([1.1 * until, high[0]])
             labels = ["time t [s]" if self._clock == "time" else "round", *labels]
             self._columns = np.unique(moments(self, 200, 0.5))
-            if team is not None:
-                self._tube = np.stack([regions(team, x, self._points) for x in _between(self.x, self._columns)], axis=2)
-        for axis, label, a, b in zip("xyz", labels, low, high, strict=False):
-            axes.set(**{f"{axis}lim": (a, b), f"{axis}label": label})
+        for axis, text, a, b in zip("xyz", labels, low, high, strict=False):
+            axes.set(**{f"{axis}lim": (a, b), f"{axis}label": text})
         axes.set_aspect("auto" if self._line else "equal")
+        self._low, self._high = low, high
         self._unit = (high - low)[:2] if self._line else np.full(2, np.max(high - low))
         axes.grid(color="0.92", linewidth=0.8)
         axes.set_axisbelow(True)
-        if self._space and team is not None:
-            for k, sphere in _spheres(team).items():
-                axes.plot_wireframe(*sphere, color=colour(team.owner[k]), linewidth=0.5, alpha=0.4)
+        if self._space:
+            axes.computed_zorder = False  # agents are seen through regions
+        if team is not None:
+            self._settle(team, x)
         points = 330.0 * self._trail(self.last)[-1, :, :2] / self._unit
-        self._where = _directions(points[: len(self._ids)], list(map(len, self._ids)))
+        self._where = _directions(points[: len(self._ids)], list(map(len, self._ids))) if self._few else []
         return 1.25 if self._line or self._space else float((high - low)[0] / (high - low)[1])
 
-    def _colour_bar(self) -> tuple[int, int]:
-        margins = self._agent_margin[self.last]
-        bound = np.abs(margins[np.isfinite(margins)]).max(initial=0.0) or 1.0
-        beside = 0.12 if self._space else 0.03
-        self._colours = ScalarMappable(CenteredNorm(halfrange=bound), "RdBu")
-        self.figure.colorbar(self._colours, ax=self.axes, label=r"agent margin $\barα_i$ (red: violated)", extend="both", pad=beside)
-        return 0, 6
+    def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray | None:
+        """(B, 2, p) around the regions that the view has to hold besides what `view` finds."""
+        if self._team is None:
+            return None
+        found = [boxes(self._team)[:, :, :axes]]
+        if not self._few and self._shapes is not None and not self._line:
+            balls = self._shapes.balls
+            fixed = balls.around < 0
+            center, radius = balls.at(x)[fixed, None, :axes], balls.radius[fixed, None, None]
+            found.append(np.concatenate([center - radius, center + radius], axis=1))
+        return np.concatenate(found)
+
+    def _settle(self, team: Any, x: np.ndarray) -> None:
+        """The regions: those of a few agents follow at every `show`, those of a crowd that stay where they are stand here."""
+        if self._line and self._few:
+            values = np.stack([regions(team, at, self._points) for at in _between(self.x, self._columns)], axis=2)
+            self._areas, self._tube = areas.areas(team, values), values
+        elif self._few and not self._space:
+            shape = (-1, self._fine, self._fine)
+            values = regions(team, x, self._points).reshape(shape).swapaxes(1, 2)
+            self._moves = [family for family in team.families if family.arity > 1]
+            self._still = np.array([number for family in team.families if family.arity == 1 for number in family.number], dtype=int)
+            self._areas, self._values = areas.areas(team, values), values
+        elif self._few:
+            self._areas = areas.areas(team)
+        elif self._shapes is not None and not self._space and not self._line:
+            self._plain(self._shapes, x)
+        if self._few and not self._space:
+            self._ground = Ground(self.axes, team, self._areas, self._unit)
+
+    def _plain(self, found: Shapes, x: np.ndarray) -> None:
+        """The regions of a crowd in the plane, of constraints that don't move with agents."""
+        axes, team = self.axes, cast(Any, self._team)
+        center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
+        goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
+        self._kinds = {"goal": len(goals), "bar": len(bars)}
+        look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
+        if len(goals):
+            discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # all of one sense, so that overlaps are tinted once
+            union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
+            axes.add_artist(union)
+        if 0 < len(goals) <= MOST_TINTED:
+            size = 2 * found.balls.radius[goals]
+            ring: dict[str, Any] = {"facecolors": "none", "edgecolors": [(*AREA, 0.55)], "linewidths": 0.7, "gid": "boundary"}
+            axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.7, **ring, **look))
+        if len(bars) > MOST_HATCHED:
+            size = 2 * found.balls.radius[bars]
+            dark: dict[str, Any] = {"facecolors": [(0.3, 0.3, 0.3, 0.35)], "edgecolors": [(0.3, 0.3, 0.3, 0.8)], "linewidths": 0.6}
+            axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.8, gid="keep-out", **dark, **look))
+        for k in bars if len(bars) <= MOST_HATCHED else ():
+            areas.hatched(axes, SHARED).set_path(Path.circle(center[k], found.balls.radius[k]))
+            axes.add_artist(Circle(center[k], found.balls.radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
+        for normal, offset in list(zip(found.walls.normal, found.walls.offset, strict=True))[:MOST_WALLS]:
+            areas.wall(axes, self._low, self._high, normal, offset, SHARED)
+        others = [family for family in team.families if family.arity == 1 and np.isin(family.number, found.others).any()]
+        if 0 < sum(family.size for family in others) <= MOST_OTHERS:
+            values = regions(team, x, self._points, others).reshape(-1, self._fine, self._fine).swapaxes(1, 2)
+            across, up = self._along
+            for number in sorted(int(number) for family in others for number in family.number):
+                for line in areas.contours(across, up, values[number]):
+                    axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))
+
+    def _crowd_legend(self, own: bool) -> tuple[int, int]:
+        """A colour bar for the agents' margins, and below what the lines are; returns the legend's rows and the bar's letters."""
+        palette, norm, edges, extend = classes(self._agent_margin[self.last])
+        self._colours = ScalarMappable(norm, palette)
+        place: dict[str, Any] = {"pad": 0.12, "shrink": 0.75} if self._space else {"pad": 0.03}
+        place |= {"label": r"agent margin $\barα_i$ (red: violated)", "ticks": edges, "spacing": "uniform", "extend": extend}
+        bar = self.figure.colorbar(self._colours, ax=self.axes, **place)
+        bar.ax.set_yticklabels([number(edge) for edge in edges])
+        line = functools.partial(Line2D, [], [])
+        lines: list[Any] = [line(marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")]
+        if self.x.shape[1] <= MOST_LINES:
+            lines.append(line(color=TRAIL, linewidth=2, marker="o", markerfacecolor="white", markersize=4, label="start and path"))
+        if len(self._links):
+            lines.append(line(color=LINK, linewidth=0.9, label="communication link"))
+        if self._space and self._shapes is not None:
+            drawn = [bool(self._shapes.balls.keeps_out[k]) for k in space.chosen(self._shapes)]
+            self._kinds = {"goal": drawn.count(False), "bar": drawn.count(True)}
+            lines.append(line(color=space.FLOOR, marker=".", linestyle=":", label="shadow on the floor"))
+        kinds = getattr(self, "_kinds", {})
+        if kinds.get("goal"):
+            lines.append(Patch(facecolor=(*AREA, 0.12), edgecolor=(*AREA, 0.7), label="region to be in"))
+        if kinds.get("bar"):
+            lines.append(areas.legend_patch(SHARED, "keep-out"))
+        if own:
+            self.figure.legend(handles=lines, loc="outside lower center", ncols=min(3, len(lines)), frameon=False)
+        else:
+            self.axes.legend(handles=lines, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(3, len(lines)), frameon=False)
+        return 0, 8
 
     def _legend(self) -> tuple[int, int]:
         """Who is who, and whose region is which; returns its rows and letters."""
         line, team, ids = functools.partial(Line2D, [], []), self._team, self._ids
-        lines = [line(color=colour(i), marker=marker(i), label=name) for i, name in enumerate(ids)]
+        lines: list[Any] = [line(color=colour(i), marker=marker(i), label=name) for i, name in enumerate(ids)]
         lines.append(line(color=GREY, marker="o", markerfacecolor="white", linestyle="", label="start"))
         if len(self._links) and not self._line:
-            lines.append(line(color="0.75", linewidth=1, label="communication link"))
-        drawn = [] if team is None else [*(_spheres(team) if self._space else range(len(team.owner)))]
-        if team is not None and drawn:
-            lines.append(line(linestyle="", label="\n" + ("regions of `within`:" if self._space else "regions, as the others stand:")))
-            for k in drawn if len(drawn) <= MOST_ENTRIES else ():
-                shade, dash = self._stroke(k)
-                lines.append(line(color=shade, linestyle=dash, linewidth=1.1, label=f"{ids[team.owner[k]]}: {plain(team.names[k])}"))
-            if not self._space:
-                lines.append(line(color=GREY, marker=3, linewidth=1.1, label="on this side ψ < 0"))
-                lines.append(line(color=GREY, linewidth=8, alpha=0.25, solid_capstyle="butt", label="all of an agent's ψ > 0"))
+            lines.append(line(color=LINK, linewidth=1, linestyle=DOTS, label="communication link"))
+        if self._space:
+            lines.append(line(color=space.FLOOR, marker=".", linestyle=":", label="shadow on the floor"))
+        if team is not None and self._areas:
+            lines.append(line(linestyle="", label="\nregions, as the others stand:"))
+            lines += self._region_lines()
         beside = (1.1 if self._space else 1.02, 1.0)
         self.axes.legend(handles=lines, loc="upper left", bbox_to_anchor=beside, frameon=False, borderaxespad=0)
         return len(lines) + 1, max(len(str(entry.get_label())) for entry in lines)
 
-    def _stroke(self, constraint: Any) -> tuple[str, Any]:
-        """The colour and style of a constraint's boundary: its owner's colour, a style for each of the owner's."""
-        owner = cast(Team, self._team).owner
-        rank = int(np.count_nonzero(owner[:constraint] == owner[constraint]))
-        return colour(owner[constraint]), STYLES[rank % len(STYLES)]
+    def _region_lines(self) -> Iterator[Any]:
+        """The legend's entries for regions: each by name, or of very many what the strokes mean."""
+        line = functools.partial(Line2D, [], [])
+        told = {f"{self._owners(area)}: {plain(area.name)}": area for area in reversed(self._areas)}
+        if len(told) > MOST_ENTRIES:
+            yield line(color=GREY, linewidth=1.2, label="edge of a constraint")
+            if any(area.keeps_out for area in self._areas):
+                yield areas.legend_patch(SHARED, "keep out")
+        else:
+            for name, area in reversed(told.items()):
+                dash: Any = "-" if self._space else area.style
+                if area.keeps_out:
+                    yield areas.legend_patch(area.colour, f"{name}, keep out")
+                else:
+                    yield line(color=area.colour, linestyle=dash, linewidth=1.2, label=name)
+        if any(area.leaves for area in self._areas):
+            yield line(color=GREY, marker=3, linewidth=1.2, label="forbidden side")
+        if not self._space:
+            yield line(color=GREY, linewidth=8, alpha=0.25, solid_capstyle="butt", label="where an agent may be")
+
+    def _owners(self, area: Area) -> str:
+        names = [self._ids[owner] for owner in area.owners]
+        return ", ".join(names) if len(names) <= 3 else f"{len(names)} agents"
+
+    # ---- what moves
+
+    def _cast(self) -> None:
+        """Make the artists in the plane; `show` moves them."""
+        trail, axes = self._trail(0.0), self.axes
+        ground = [] if self._ground is None else self._ground.artists
+        look: dict[str, Any] = {"linewidth": 1.0, "linestyle": DOTS} if self._few else {"linewidth": 0.7}
+        self._wires = Line2D([], [], color=LINK, alpha=0.8, zorder=1.5, gid="link", **look)
+        axes.add_artist(self._wires)
+        self._names: list[Any] = []
+        if self._few:
+            every = range(self.x.shape[1])
+            self._paths = [axes.plot([], [], **_path(i))[0] for i in every]
+            starts = [axes.plot(*trail[0, i, :, None], **_start(i))[0] for i in every]
+            self._heads = [axes.plot([], [], **_head(i))[0] for i in every]
+            for i, name in enumerate(self._ids):
+                x, y = self._where[i]
+                place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
+                self._names.append(axes.annotate(name, trail[0, i], (7 * x, 7 * y), textcoords="offset points", **_ink(i), **place))
+            self.moving = [*ground, self._wires, *self._paths, *starts, *self._heads, *self._names]
+            return
+        count = trail.shape[1]
+        self._paths = [axes.plot([], [], color=TRAIL, linewidth=1.0, zorder=1, gid="path")[0]]
+        if count <= MOST_LINES:
+            size = 3.5 if count < 200 else 1.5
+            axes.plot(*trail[0].T, "o", color=TRAIL, markerfacecolor="white", markersize=size, zorder=1.2, gid="start")
+        self._dots = axes.scatter(*trail[-1].T, **_dots(count))
+        self.moving = [self._paths[0], self._wires, self._dots]
 
     def show(self, moment: float) -> None:
         """Draw the formation at a moment."""
-        for artist in self.moving:
-            artist.remove()
         trail, sample = self._trail(moment), int(moment)
-        self.moving = [*self._regions(moment), *(self._agents(trail) if self._few else self._crowd(trail, sample))]
-        if not self._line:
-            self.moving += self.axes.plot(*_joined(trail[-1][self._links]), color="0.75", linewidth=1 if self._few else 0.6, zorder=1.5)
+        if self._space:
+            for artist in self.moving:
+                artist.remove()
+            bodies = self._bodies(_between(self.x, moment)[0], moving=True)
+            self.moving = [*bodies, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
+            self.moving += self._agents(trail) if self._few else self._crowd(trail, sample)
+            style: dict[str, Any] = {"color": LINK, "linewidth": 1 if self._few else 0.6, "linestyle": DOTS, "gid": "link"}
+            self.moving += self.axes.plot(*_joined(trail[-1][self._links]), **style)
+        else:
+            self._move(trail, moment)
         clock = f"{_between(self.steps, moment)[0]:.1f}".removesuffix(".0")
         time = f"t = {clock} s" if self._clock == "time" else f"round {self.steps[sample]:.0f}"
         notes = [*self._sample, *["starts out of view"] * self._cut] + [f"the first two of {self.x.shape[2]} axes"] * (self.x.shape[2] > 3)
         margin = f", margin {number(self._margin[sample])}" if np.isfinite(self._margin[sample]) else ""
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 
+    def _move(self, trail: np.ndarray, moment: float) -> None:
+        if not self._line:
+            self._wires.set_data(*_joined(trail[-1][self._links]))
+        if self._ground is not None and self._line:
+            seen = np.count_nonzero(self._columns <= moment)
+            self._ground.show(_between(self.steps, self._columns[:seen]), self._along[0], self._tube[:, :, :seen])
+        elif self._ground is not None:
+            if self._moves:
+                shape = self._values.shape
+                values = regions(cast(Any, self._team), _between(self.x, moment)[0], self._points, self._moves)
+                values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
+                values[self._still] = self._values[self._still]
+                self._values = values
+            across, up = self._along
+            self._ground.show(across, up, self._values)
+        if self._few:
+            for i, (path, head, name) in enumerate(zip(self._paths, self._heads, self._names, strict=True)):
+                path.set_data(*trail[:, i].T)
+                head.set_data(*trail[-1, i, :, None])
+                name.xy = trail[-1, i]
+            return
+        self._paths[0].set_data(*_joined(_thin(trail)))
+        margins = self._agent_margin[int(moment)]
+        self._dots.set_offsets(trail[-1])
+        self._dots.set_facecolor(self._shades(margins))
+        for name in self._names:
+            name.remove()
+            self.moving.remove(name)
+        worst: list[int] = []
+        for i in np.argsort(margins)[:MOST_ASKED] if not self._line else ():
+            clear = all(np.any(np.abs(trail[-1, i] - trail[-1, other]) > self._unit * [0.08, 0.03]) for other in worst)
+            if margins[i] <= 0 and clear and len(worst) < MOST_TIGHTEST:
+                worst.append(int(i))
+        style: dict[str, Any] = {"fontsize": 8, "path_effects": [withStroke(linewidth=2, foreground="w")], "zorder": 6}
+        self._names = [
+            self.axes.annotate(self._ids[i], trail[-1, i], (5, 5), textcoords="offset points", clip_on=True, annotation_clip=True, **style)
+            for i in worst
+        ]
+        self.moving += self._names
+
+    def _shades(self, margins: np.ndarray) -> Any:
+        return self._colours.to_rgba(np.ma.masked_invalid(margins))
+
+    def _bodies(self, x: np.ndarray, *, moving: bool) -> Iterator[Artist]:
+        """Regions in space with the team at x (N, d): those that move with agents, or those that stay."""
+        if self._team is None or self._shapes is None:
+            return
+        found, ties = self._shapes, moves(self._team)
+        chosen = [k for k in space.chosen(found) if (found.balls.around[k] >= 0) == moving]
+        yield from space.balls(self.axes, found.balls, x, chosen, None if self._few else AREA)
+        if not moving:
+            yield from space.walls(self.axes, found.walls, self._low, self._high)
+        others = [k for k in found.others.tolist() if ties[k] == moving]
+        if self._few and others:
+            yield from space.sections(self.axes, self._team, others, x, self._low, self._high)
+
     def _agents(self, trail: np.ndarray) -> Iterator[Artist]:
+        """A few agents in space."""
         for i, name in enumerate(self._ids):
-            yield from self.axes.plot(*trail[:, i].T, color=colour(i), linewidth=1.6, alpha=0.85, zorder=3)
-            yield from self.axes.plot(*trail[0, i, :, None], marker(i), color=colour(i), markerfacecolor="white", markersize=7, zorder=4)
-            yield from self.axes.plot(*trail[-1, i, :, None], marker(i), color=colour(i), markersize=8, markeredgecolor="white", zorder=5)
-            style: dict[str, Any] = {"color": colour(i), "weight": "bold", "path_effects": [withStroke(linewidth=2.5, foreground="w")]}
-            if self._space:
-                yield self.axes.text(*trail[-1, i], f"  {name}", **style)
-            else:
-                x, y = self._where[i]
-                style |= {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)]}
-                yield self.axes.annotate(name, trail[-1, i], (7 * x, 7 * y), textcoords="offset points", zorder=6, **style)
+            yield from self.axes.plot(*trail[:, i].T, **_path(i))
+            yield from self.axes.plot(*trail[0, i, :, None], **_start(i))
+            yield from self.axes.plot(*trail[-1, i, :, None], **_head(i))
+            yield self.axes.text(*trail[-1, i], f"  {name}", **_ink(i))
 
     def _crowd(self, trail: np.ndarray, sample: int) -> Iterator[Artist]:
-        """Many agents, coloured by margin."""
+        """Many agents in space, coloured by margin."""
         count = trail.shape[1]
         if count <= MOST_LINES:
-            paths = np.concatenate([trail[: -1 : max(1, trail.shape[0] * count // 400_000)], trail[-1:]]).swapaxes(0, 1)
-            yield from self.axes.plot(*_joined(paths), color="0.6", linewidth=0.7, alpha=0.6, zorder=1)
-            yield from self.axes.plot(*trail[0].T, "o", color="0.6", markerfacecolor="white", markersize=3 if count < 200 else 1, zorder=4)
-        style = {"s": 36 if count < 200 else 8, "edgecolors": "0.3", "linewidths": 0.5, "zorder": 5}
-        yield self.axes.scatter(*trail[-1].T, c=self._colours.to_rgba(self._agent_margin[sample]), **style)
+            yield from self.axes.plot(*_joined(_thin(trail)), color=TRAIL, linewidth=0.8, zorder=1, gid="path")
+        yield self.axes.scatter(*trail[-1].T, c=self._shades(self._agent_margin[sample]), depthshade=False, **_dots(count))
 
-    def _regions(self, moment: float) -> Iterator[Artist]:
-        if self._team is None or self._space:
-            return
-        if self._line:
-            seen = np.count_nonzero(self._columns <= moment)
-            across, up, values = _between(self.steps, self._columns[:seen]), self._along[0], self._tube[:, :, :seen]
-        else:
-            across, up = self._along
-            values = regions(self._team, _between(self.x, moment)[0], self._points).reshape(-1, GRID, GRID).swapaxes(1, 2)
-        for owner in np.unique(self._team.owner) if len(across) > 1 else ():
-            mine = np.flatnonzero(self._team.owner == owner)
-            common = values[mine].min(axis=0)
-            if (common > 0).any():
-                yield self.axes.contourf(across, up, common, [0.0, np.nanmax(common)], colors=[colour(owner)], alpha=0.13, zorder=0.5)
-            for k in mine:
-                if (values[k] > 0).any() and (values[k] < 0).any():
-                    shade, dash = self._stroke(k)
-                    edge = self.axes.contour(across, up, values[k], [0.0], colors=[shade], linestyles=[dash], linewidths=1.1, zorder=2)
-                    yield edge
-                    yield from self.axes.plot(*_joined(_ticks(edge, self._unit)), color=shade, linewidth=0.8, zorder=2)
+
+def _path(agent: int) -> dict[str, Any]:
+    return {"color": colour(agent), "linewidth": 1.7, "alpha": 0.85, "zorder": 3, "gid": "path"}
+
+
+def _start(agent: int) -> dict[str, Any]:
+    look = {"markerfacecolor": "white", "markersize": 7, "zorder": 4, "gid": "start"}
+    return {"color": colour(agent), "marker": marker(agent), "linestyle": "", **look}
+
+
+def _head(agent: int) -> dict[str, Any]:
+    look = {"markeredgecolor": "white", "markersize": 8, "zorder": 5, "gid": "head"}
+    return {"color": colour(agent), "marker": marker(agent), "linestyle": "", **look}
+
+
+def _dots(count: int) -> dict[str, Any]:
+    """The look of a crowd of so many."""
+    return {"s": 40 if count < 60 else 22 if count < 200 else 9, "edgecolors": "0.2", "linewidths": 0.5, "zorder": 5, "gid": "head"}
+
+
+def _ink(agent: int) -> dict[str, Any]:
+    """How the name of an agent is written."""
+    return {"color": colour(agent), "weight": "bold", "path_effects": [withStroke(linewidth=2.5, foreground="w")]}
+
+
+def _thin(trail: np.ndarray) -> np.ndarray:
+    """(N, K, p) the paths of a crowd (T, N, p), with fewer points where they are very many; of more than `MOST_LINES` agents, none."""
+    steps, count = trail.shape[:2]
+    if count > MOST_LINES:
+        return trail[:0].swapaxes(0, 1)
+    return np.concatenate([trail[: -1 : max(1, steps * count // 400_000)], trail[-1:]]).swapaxes(0, 1)
 
 
 def _between(series: np.ndarray, moment: Any) -> np.ndarray:
@@ -204,34 +423,9 @@ def _between(series: np.ndarray, moment: Any) -> np.ndarray:
     return (1 - share) * series[moment.astype(int)] + share * series[np.ceil(moment).astype(int)]
 
 
-def _spheres(team: Team) -> dict[int, np.ndarray]:
-    """(3, 17, 9) points on the sphere of every `within`, by number of the constraint."""
-    around, down = np.meshgrid(np.linspace(0, 2 * np.pi, 17), np.linspace(0, np.pi, 9), indexing="ij")
-    unit = np.stack([np.cos(around) * np.sin(down), np.sin(around) * np.sin(down), np.cos(down)])
-    return {
-        int(number): center[:, None, None] + radius * unit
-        for family in team.families
-        if family.kind == "within"
-        for number, center, radius in zip(family.number, family.parameters["center"], family.parameters["radius"], strict=True)
-    }
-
-
 def _joined(segments: np.ndarray) -> np.ndarray:
     """(S, K, p) lines → (p, S·(K + 1)) one line, broken by NaN: one artist is much quicker than many."""
     return np.concatenate([segments, np.full_like(segments[:, :1], np.nan)], axis=1).reshape(-1, segments.shape[2]).T
-
-
-def _ticks(edge: QuadContourSet, unit: np.ndarray) -> np.ndarray:
-    """(K, 2, 2) short strokes that stand on a boundary, on the side where ψ < 0; contour lines run with the higher values on their left."""
-    strokes = [np.zeros((0, 2, 2))]
-    for piece in edge.allsegs[0]:
-        line = piece / unit
-        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
-        at = np.arange(1 / 80, way[-1], 1 / 40)
-        foot, ahead = (np.stack([np.interp(at + step, way, line[:, k]) for k in (0, 1)], axis=1) for step in (0.0, 1 / 4000))
-        right = (ahead - foot)[:, ::-1] * [1.0, -1.0]
-        strokes.append(np.stack([foot, foot + right / np.maximum(np.hypot(*right.T), 1e-300)[:, None] / 120], axis=1) * unit)
-    return np.concatenate(strokes)
 
 
 def moments(scene: Scene, count: int, movement: float) -> np.ndarray:

@@ -30,13 +30,18 @@ def save(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], path: st
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
+    draw(summary, runs).savefig(target, dpi=DPI)
+    return target
+
+
+def draw(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Figure:
+    """The figure that `save` writes."""
     figure = Figure(figsize=(8.4, 8.2), layout="constrained")
     if summary["over"]:
         _over(figure, summary)
     else:
         _seeds(figure, summary, runs)
-    figure.savefig(target, dpi=DPI)
-    return target
+    return figure
 
 
 def _title(summary: Mapping[str, Any]) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 OWNER: Final = "@owner"
 """Stands in `Constraint.reads` for the agent that will own the constraint."""
@@ -66,6 +66,10 @@ class Constraint:
     name: str | None = None
     weight: float = 1.0
     source: str | None = None
+
+
+Constraints: TypeAlias = "Sequence[Constraint | Sequence[Constraint]]"
+"""Constraints of an agent: what `consat.within` and its like return, a list of them where that is a list (`consat.box`)."""
 
 
 def flatten(item: Any) -> Iterator[Any]:

@@ -1,0 +1,80 @@
+"""What summaries hold: the keys of ``run --json`` and ``sweep --json``, for type checkers and readers."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NotRequired, TypedDict
+
+Verdict = Literal["feasible", "infeasible", "undecided"]
+
+
+class SatisfiedFrom(TypedDict):
+    """The first step after the last one whose margin was ≤ 0, as a time in s and as a round; None where there is none."""
+
+    time: float | None
+    round: float | None
+
+
+class ConstraintSummary(TypedDict):
+    """One constraint at the end of a run."""
+
+    name: str
+    margin: float | None
+    multiplier: float | None
+    violated_share: NotRequired[float | None]
+
+
+class AgentSummary(TypedDict):
+    """One agent at the end of a run; its margin is None without constraints."""
+
+    margin: float | None
+    constraints: list[ConstraintSummary]
+
+
+class RunSummary(TypedDict):
+    """What ``consat run --json`` prints (schema consat.run/1)."""
+
+    schema: Literal["consat.run/1"]
+    scenario: str
+    version: str
+    protocol: str
+    estimates: Literal["local", "full"]
+    seed: int
+    status: Literal["satisfied", "least-violating", "not-converged", "diverged"]
+    verdict: Verdict
+    margin: float | None
+    smooth_margin: float | None
+    bounds: list[float | None]
+    satisfied_from: SatisfiedFrom
+    known: NotRequired[Literal["satisfied", "infeasible"] | None]
+    known_from: NotRequired[float | None]
+    rounds: int | None
+    time: NotRequired[float | None]
+    ending: str
+    messages: int | None
+    floats_sent: int | None
+    positions: dict[str, list[float | None]] | None
+    agents: dict[str, AgentSummary] | None
+    clusters: NotRequired[list[list[str]] | None]
+    on_the_way: NotRequired[dict[str, Any] | None]
+    count: int
+    warnings: NotRequired[list[str]]
+    result: NotRequired[str | None]
+    seconds: NotRequired[dict[str, float]]
+    route: NotRequired[str | None]
+    motion: NotRequired[dict[str, Any]]
+    verdicts: NotRequired[list[dict[str, Any]]]
+
+
+class SweepSummary(TypedDict):
+    """What ``consat sweep --json`` prints (schema consat.sweep/1)."""
+
+    schema: Literal["consat.sweep/1"]
+    scenario: str
+    protocol: str
+    estimates: Literal["local", "full"]
+    over: dict[str, list[Any]]
+    seeds: list[int]
+    count: int
+    seconds: float
+    groups: list[dict[str, Any]]
+    runs: NotRequired[list[dict[str, Any]] | None]

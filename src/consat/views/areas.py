@@ -1,0 +1,221 @@
+"""Where constraints hold, drawn on 2-D axes: what an agent may use is tinted, what it must keep out of is hatched.
+
+A constraint that several agents share is drawn once. Values of ψ on a grid become paths, which the artists take over: nothing is made
+anew from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from contourpy import FillType, LineType, contour_generator
+from matplotlib.artist import Artist
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
+
+from consat.problem.team import Team
+from consat.views.figures import STYLES, colour
+from consat.views.shapes import BALLS, alike, moves
+
+SHARED: Final = "0.3"
+"""The colour of what several agents share."""
+HATCH: Final = "////"
+TINT, SHADE = 0.15, 0.16
+
+
+@dataclass(frozen=True)
+class Area:
+    """Where one constraint holds, or those of several agents that are alike.
+
+    Attributes:
+        number: of the (first) constraint.
+        name: of the constraint; the sides of a box have the same.
+        owners: places of those whose constraint it is.
+        keeps_out: whether the forbidden side is the inner one.
+        leaves: whether its boundary leaves the view, so that ticks must tell the forbidden side.
+        moves: whether it moves with teammates.
+        colour: of its boundary.
+        style: of its boundary.
+    """
+
+    number: int
+    name: str
+    owners: tuple[int, ...]
+    keeps_out: bool
+    leaves: bool
+    moves: bool
+    colour: str
+    style: Any
+
+
+def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
+    """The different regions of a team.
+
+    Args:
+        team: the team.
+        values: (M, L, K) every ψ over a grid; without them only library kinds are known to keep out.
+    """
+    first, owners, ties, found = alike(team), np.asarray(team.owner), moves(team), []
+    kinds = {int(number): family.kind for family in team.families if family.sources is None for number in family.number}
+    ranks: dict[int, dict[str, int]] = defaultdict(dict)
+    for number in map(int, np.flatnonzero(first == np.arange(len(first)))):
+        mine = tuple(sorted({int(owner) for owner in owners[first == number]}))
+        kind, name = kinds.get(number, ""), team.names[number]
+        name = name.rpartition(".")[0] if kind == "box" else name
+        rank = ranks[int(owners[number])].setdefault(name, len(ranks[int(owners[number])]))
+        keeps_out, leaves = BALLS.get(kind, False), False
+        if values is not None:
+            edge = values[number][_edge(values.shape[1:])]
+            keeps_out = keeps_out or bool((values[number] < 0).any() and (edge > 0).all())
+            leaves = bool(not keeps_out and (edge > 0).any() and (edge < 0).any())
+        shade = colour(mine[0]) if len(mine) == 1 else SHARED
+        found.append(
+            Area(number, name, mine, keeps_out, leaves, bool(ties[number]), shade, "-" if keeps_out else STYLES[rank % len(STYLES)])
+        )
+    return found
+
+
+def _edge(shape: tuple[int, ...]) -> np.ndarray:
+    """Which points of a grid are on its edge."""
+    edge = np.ones(shape, dtype=bool)
+    edge[(slice(1, -1),) * len(shape)] = False
+    return edge
+
+
+class Ground:
+    """The regions of a few agents as artists.
+
+    Args:
+        axes: what to draw on.
+        team: the team.
+        found: its `areas`.
+        unit: (2,) the size of the view on each axis, for the length of ticks.
+
+    Attributes:
+        artists: those that `show` changes.
+    """
+
+    def __init__(self, axes: Any, team: Team, found: Sequence[Area], unit: np.ndarray) -> None:
+        self.found, self._unit = found, unit
+        first = alike(team)
+        closed = {area.number for area in found if not area.keeps_out}
+        alike_goals: dict[frozenset[int], list[int]] = {}
+        mine: dict[int, set[int]] = {}
+        for owner in map(int, np.unique(team.owner)):
+            mine[owner] = set(first[np.flatnonzero(team.owner == owner)].tolist())
+            if mine[owner] & closed:  # else all but some holes would be tinted
+                alike_goals.setdefault(frozenset(mine[owner] & closed), []).append(owner)
+        self._common: list[tuple[list[int], PathPatch]] = []
+        for owners in alike_goals.values():
+            tint = colour(owners[0]) if len(owners) == 1 else SHARED
+            numbers = sorted(set.intersection(*(mine[owner] for owner in owners)))
+            self._common.append((numbers, _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.6)))
+        self._edges = [
+            _patch(axes, "boundary", fill=False, edgecolor=area.colour, linestyle=area.style, **_weight(area), zorder=2) for area in found
+        ]
+        self._ticks = [_patch(axes, "ticks", fill=False, edgecolor=area.colour, linewidth=0.8, zorder=2) for area in found]
+        self._keep_outs = {area.number: hatched(axes, area.colour) for area in found if area.keeps_out}
+        common = [patch for _, patch in self._common]
+        self.artists: list[Artist] = [*common, *self._keep_outs.values(), *self._edges, *self._ticks]
+
+    def show(self, across: np.ndarray, up: np.ndarray, values: np.ndarray) -> None:
+        """Draw the regions of all ψ.
+
+        Args:
+            across: (K,) coordinates.
+            up: (L,) coordinates.
+            values: (M, L, K) ψ, NaN where not finite.
+        """
+        some = len(across) > 1
+        for numbers, patch in self._common:
+            patch.set_path(filled(across, up, values[numbers].min(axis=0)) if some else Path(np.zeros((0, 2))))
+        for area, edge, ticks in zip(self.found, self._edges, self._ticks, strict=True):
+            psi = values[area.number]
+            lines = list(contours(across, up, psi)) if some else []
+            edge.set_path(Path.make_compound_path(*map(Path, lines)) if lines else Path(np.zeros((0, 2))))
+            ticks.set_path(_strokes(lines if area.leaves else [], self._unit))
+            if area.keeps_out:
+                self._keep_outs[area.number].set_path(filled(across, up, -psi) if some else Path(np.zeros((0, 2))))
+
+
+def _weight(area: Area) -> dict[str, float]:
+    """Goals stand out; what moves with teammates stands back."""
+    return {"linewidth": 1.0, "alpha": 0.65} if area.moves else {"linewidth": 1.4, "alpha": 1.0}
+
+
+def _patch(axes: Any, gid: str, **style: Any) -> PathPatch:
+    patch = PathPatch(Path(np.zeros((0, 2))), gid=gid, **style)
+    axes.add_artist(patch)
+    return patch
+
+
+def hatched(axes: Any, shade: Any) -> PathPatch:
+    """A keep-out without a path, on axes; the look of keep-outs in every view."""
+    patch = _patch(axes, "keep-out", **keep_out_style(shade), zorder=1)
+    patch.set_hatch_linewidth(0.7)
+    return patch
+
+
+def keep_out_style(shade: Any) -> dict[str, Any]:
+    """How a keep-out is filled: tinted, and hatched in its colour."""
+    return {"facecolor": to_rgba(shade, SHADE), "edgecolor": to_rgba(shade, 0.75), "hatch": HATCH, "linewidth": 0.0}
+
+
+def legend_patch(shade: Any, label: str) -> Patch:
+    """The legend's entry for a keep-out."""
+    patch = Patch(**keep_out_style(shade), label=label)
+    patch.set_hatch_linewidth(0.7)
+    return patch
+
+
+def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
+    """(K, 2) polylines where values (L, K) are zero, with the higher values on their left; closed ones end where they begin."""
+    if np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
+        lines: Any = contour_generator(across, up, np.ma.masked_invalid(values), line_type=LineType.Separate).lines(0.0)
+        yield from lines
+
+
+def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
+    """Where values (L, K) are positive."""
+    top = float(np.nanmax(values, initial=0.0))
+    if top <= 0:
+        return Path(np.zeros((0, 2)))
+    found: Any = contour_generator(across, up, np.ma.masked_invalid(values), fill_type=FillType.OuterCode).filled(0.0, 2 * top)
+    pieces = [Path(outline, code) for outline, code in zip(*found, strict=True)]
+    return Path.make_compound_path(*pieces) if pieces else Path(np.zeros((0, 2)))
+
+
+def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
+    """Short strokes that stand on boundaries, on the side where ψ < 0, which is to the right of the lines."""
+    found = [np.zeros((0, 2, 2))]
+    for piece in lines:
+        line = piece / unit
+        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+        at = np.arange(1 / 80, way[-1], 1 / 40)
+        foot, ahead = (np.stack([np.interp(at + step, way, line[:, k]) for k in (0, 1)], axis=1) for step in (0.0, 1 / 4000))
+        right = (ahead - foot)[:, ::-1] * [1.0, -1.0]
+        found.append(np.stack([foot, foot + right / np.maximum(np.hypot(*right.T), 1e-300)[:, None] / 80], axis=1) * unit)
+    segments = np.concatenate(found)
+    if not len(segments):
+        return Path(np.zeros((0, 2)))
+    return Path(segments.reshape(-1, 2), np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments)))
+
+
+def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> list[Artist]:
+    """The boundary of a half-space normal·x ≤ offset in the plane, with ticks on its forbidden side."""
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    foot = middle - (middle @ normal - offset) * normal
+    along = np.array([-normal[1], normal[0]]) * size
+    line = np.stack([foot - along, foot + along])  # the forbidden side is to its right
+    unit = np.full(2, float((high - low).max()))
+    edge = Line2D(*line.T, color=shade, linewidth=1.2, zorder=2, gid="boundary")
+    ticks = PathPatch(_strokes([line], unit), fill=False, edgecolor=shade, linewidth=0.8, zorder=2, gid="ticks")
+    for artist in (edge, ticks):
+        axes.add_artist(artist)
+    return [edge, ticks]

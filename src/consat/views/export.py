@@ -1,0 +1,79 @@
+"""A result as a file of another kind; what kind, the ending of its name says."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from consat.errors import InvalidSettings, closest
+from consat.results.result import Result
+
+Progress = Callable[[float], None]
+
+
+def _csv(result: Result, target: Path, progress: Progress | None) -> None:
+    """A row for each agent at each recorded time or round: where it is, and its margin; empty without constraints."""
+    import xarray as xr
+
+    data = result.data
+    clock = str(data["position"].dims[0])
+    columns = {str(axis): data["position"].sel(axis=axis, drop=True) for axis in data["axis"].values}
+    table = xr.Dataset({**columns, "margin": data["agent_margin"].where(np.isfinite(data["agent_margin"]))})
+    table = table.drop_vars([name for name in table.coords if name not in (clock, "agent")])
+    table.to_dataframe(dim_order=[clock, "agent"]).to_csv(target)
+
+
+def _html(result: Result, target: Path, progress: Progress | None) -> None:
+    from consat.views import replay
+
+    replay.save(result, target)
+
+
+def _film(result: Result, target: Path, progress: Progress | None) -> None:
+    from consat.views import animation
+
+    animation.save(result, target, progress=progress)
+
+
+def _mcap(result: Result, target: Path, progress: Progress | None) -> None:
+    from consat.views import mcap
+
+    mcap.save(result, target)
+
+
+FORMATS: Final[Mapping[str, Callable[[Result, Path, Progress | None], None]]] = {
+    ".csv": _csv,
+    ".gif": _film,
+    ".html": _html,
+    ".mcap": _mcap,
+    ".mp4": _film,
+}
+"""Endings, and what writes such a file."""
+
+
+def save(result: Result, path: str | os.PathLike[str], *, progress: Progress | None = None) -> Path:
+    """Write a result as ``.csv``, ``.gif``, ``.html``, ``.mcap`` or ``.mp4``.
+
+    Args:
+        result: of a run.
+        path: of the file.
+        progress: called with the share that is done, 0 to 1, of a film.
+
+    Raises:
+        InvalidSettings: another ending, nobody was recorded, or an extra is missing; it says which to install.
+    """
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in FORMATS:
+        kinds = ", ".join(FORMATS)
+        what = f"ends in {target.suffix}" if suffix else "has no ending"
+        raise InvalidSettings(f"{target} {what}, but must end in one of {kinds}{closest(suffix, FORMATS) if suffix else ''}")
+    if "position" not in result.data:
+        raise InvalidSettings("nobody's positions were recorded, so there is nothing to export; run with --record all")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    FORMATS[suffix](result, target, progress)
+    return target

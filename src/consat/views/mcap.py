@@ -1,0 +1,231 @@
+"""A run as an MCAP file, which Foxglove and other tools of robotics open.
+
+Topics, all in the frame ``world``: ``/agents`` foxglove.PointCloud with the fields x, y, z, margin; ``/tf`` a frame for each agent;
+``/scene`` foxglove.SceneUpdate with regions, keep-outs, links and names; ``/margin`` the numbers of the team, to plot;
+``/agent_margins`` those of each agent, of teams that are not large.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from consat.errors import InvalidSettings
+from consat.results.result import Result
+from consat.views import space
+from consat.views.figures import colour, recorded, view
+from consat.views.outlines import MOST, outlines
+from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
+
+if TYPE_CHECKING:
+    from foxglove.messages import Color, SceneEntity
+
+    from consat.problem.team import Team
+
+WORLD: Final = "world"
+ROUND: Final = 0.1
+"""Seconds that a round takes in the file, where rounds take no time."""
+MOST_NAMED, MOST_SHAPES, MOST_NUMBERS = 200, 2_000, 10_000_000
+THIN: Final = 0.02
+"""Height of discs in the plane, of their radius."""
+KEEP_OUT: Final = (0.3, 0.3, 0.3)
+LINK: Final = (0.45, 0.5, 0.57)
+
+
+def save(result: Result, path: str | os.PathLike[str]) -> Path:
+    """Write the file.
+
+    Args:
+        result: of a run whose positions were recorded.
+        path: ends in ``.mcap``.
+
+    Raises:
+        InvalidSettings: foxglove-sdk is not installed.
+    """
+    try:
+        import foxglove
+        from foxglove import channels, messages
+    except ImportError:
+        raise InvalidSettings("an MCAP file needs foxglove-sdk; install it with: pip install 'consat[mcap]'") from None
+
+    target, data, summary = Path(path), recorded(result), result.summary
+    clock = str(data["position"].dims[0])
+    x = _in_space(np.nan_to_num(data["position"].values))
+    team = None if "final_position" in result.data else result.team
+    steps = data[clock].values.astype(float)
+    times = steps if clock == "time" else steps * ROUND
+    ids = [str(name) for name in data["agent"].values]
+    margins, margin, smooth = (data[name].values for name in ("agent_margin", "margin", "smooth_margin"))
+    context = foxglove.Context()
+    about = {"scenario": str(summary["scenario"]), "clock": clock, "seconds_per_round": "" if clock == "time" else str(ROUND)}
+    with foxglove.open_mcap(target, allow_overwrite=True, context=context) as writer:
+        writer.write_metadata(
+            "consat", {**about, "status": summary["status"], "verdict": summary["verdict"], "version": summary["version"]}
+        )
+        points = channels.PointCloudChannel("/agents", context=context)
+        frames = channels.FrameTransformsChannel("/tf", context=context)
+        pictures = channels.SceneUpdateChannel("/scene", context=context)
+        number = foxglove.Channel("/margin", schema=_schema(["margin", "smooth_margin", "step"]), message_encoding="json", context=context)
+        each = foxglove.Channel("/agent_margins", schema=_schema(ids), message_encoding="json", context=context)
+        scene = _Scene(team, ids, x, int(result.data["position"].shape[2]))
+        for k, time in enumerate(times):
+            stamp = messages.Timestamp(sec=int(time), nsec=round((time - int(time)) * 1e9) % 1_000_000_000)
+            nanoseconds = round(time * 1e9)
+            points.log(_cloud(x[k], margins[k], stamp), log_time=nanoseconds)
+            if len(ids) <= MOST_NAMED:
+                frames.log(_frames(ids, x[k], stamp), log_time=nanoseconds)
+                told = {name: float(value) for name, value in zip(ids, margins[k], strict=True) if np.isfinite(value)}
+                each.log(told, log_time=nanoseconds)
+            pictures.log(messages.SceneUpdate(entities=list(scene.entities(k, stamp))), log_time=nanoseconds)
+            numbers = {"margin": _plain(margin[k]), "smooth_margin": _plain(smooth[k]), "step": float(steps[k])}
+            number.log(numbers, log_time=nanoseconds)
+    return target
+
+
+def _plain(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _schema(names: list[str]) -> dict[str, Any]:
+    return {"type": "object", "properties": {name: {"type": "number"} for name in names[: 3 * MOST_NAMED]}}
+
+
+def _in_space(x: np.ndarray) -> np.ndarray:
+    """Positions or points (…, d) with three coordinates: the first three, or zeros for those that are missing."""
+    missing = max(0, 3 - x.shape[-1])
+    return np.concatenate([x[..., :3], np.zeros((*x.shape[:-1], missing))], axis=-1)
+
+
+def _cloud(x: np.ndarray, margins: np.ndarray, stamp: Any) -> Any:
+    from foxglove import messages
+
+    number = messages.PackedElementFieldNumericType.Float32
+    fields = [messages.PackedElementField(name=name, offset=4 * k, type=number) for k, name in enumerate(("x", "y", "z", "margin"))]
+    packed = np.concatenate([x, np.where(np.isfinite(margins), margins, 0.0)[:, None]], axis=1).astype("<f4")
+    pose = messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0))
+    return messages.PointCloud(timestamp=stamp, frame_id=WORLD, pose=pose, point_stride=16, fields=fields, data=packed.tobytes())
+
+
+def _frames(ids: list[str], x: np.ndarray, stamp: Any) -> Any:
+    from foxglove import messages
+
+    still = messages.Quaternion(w=1.0)
+    return messages.FrameTransforms(
+        transforms=[
+            messages.FrameTransform(timestamp=stamp, parent_frame_id=WORLD, child_frame_id=name, translation=_vector(place), rotation=still)
+            for name, place in zip(ids, x, strict=True)
+        ]
+    )
+
+
+def _vector(place: np.ndarray) -> Any:
+    from foxglove import messages
+
+    return messages.Vector3(x=float(place[0]), y=float(place[1]), z=float(place[2]))
+
+
+class _Scene:
+    """Regions, links and names; what stands still is told once, at the first step."""
+
+    def __init__(self, team: Team | None, ids: list[str], x: np.ndarray, dimension: int) -> None:
+        self._team, self._ids, self._x, self._flat = team, ids, x, dimension < 3
+        self._shapes: Shapes | None = None
+        self._traced: list[int] = []
+        if team is not None and len(team.owner) <= 10 * MOST_SHAPES and dimension <= 3:
+            self._shapes = shapes(team)
+            others = self._shapes.others.tolist()
+            self._traced = others if dimension == 2 and len(others) <= MOST else []
+            axes = slice(0, dimension)
+            around = np.concatenate([boxes(team)[:, :, axes], np.stack([x[-1].min(axis=0), x[-1].max(axis=0)])[None, :, axes]])
+            self._low, self._high, _ = view(x[:, :, axes], x[-1, :, axes], None, around)
+            self._moves = moves(team)
+
+    def entities(self, k: int, stamp: Any) -> Iterator[SceneEntity]:
+        """What is new at a step."""
+        x = self._x[k]
+        if self._shapes is not None and self._team is not None:
+            yield from self._balls(self._shapes.balls, k, x, stamp)
+            yield from self._outlines(k, x, stamp)
+            if k == 0:
+                yield from self._walls(self._shapes.walls, stamp)
+            if len(self._team.links):
+                lines = self._line(x[self._team.links].reshape(-1, 3), LINK, 1.0, pairs=True)
+                yield self._entity("links", stamp, lines=[lines])
+        if len(self._ids) <= MOST_NAMED:
+            yield self._entity("names", stamp, texts=[self._text(name, place) for name, place in zip(self._ids, x, strict=True)])
+
+    def _entity(self, name: str, stamp: Any, **parts: Any) -> SceneEntity:
+        from foxglove.messages import SceneEntity
+
+        return SceneEntity(timestamp=stamp, frame_id=WORLD, id=name, **parts)
+
+    def _balls(self, balls: Balls, k: int, x: np.ndarray, stamp: Any) -> Iterator[SceneEntity]:
+        from foxglove import messages
+
+        chosen = np.flatnonzero(balls.around < 0) if len(balls.radius) > MOST_NAMED else np.arange(len(balls.radius))
+        centers = _in_space(balls.at(x[:, : balls.center.shape[1]]))
+        for j in chosen[:MOST_SHAPES].tolist():
+            if k and balls.around[j] < 0:
+                continue
+            out, radius = bool(balls.keeps_out[j]), float(balls.radius[j])
+            shade = _colour(KEEP_OUT if out else _rgb(balls.owners[j]), 0.7 if out else 0.12)
+            pose = messages.Pose(position=_vector(centers[j]), orientation=messages.Quaternion(w=1.0))
+            thick = 2 * radius if not self._flat else (4 if out else 1) * THIN * radius
+            size = messages.Vector3(x=2 * radius, y=2 * radius, z=thick)
+            name = f"{'keep-out' if out else 'region'} {int(balls.number[j])}"
+            if self._flat:
+                disc = messages.CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=shade)
+                body: dict[str, Any] = {"cylinders": [disc]}
+            else:
+                body = {"spheres": [messages.SpherePrimitive(pose=pose, size=size, color=shade)]}
+            angle = np.linspace(0, 2 * np.pi, 65)[:, None]
+            ring = centers[j] + radius * np.concatenate([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+            yield self._entity(name, stamp, lines=[self._line(ring, KEEP_OUT if out else _rgb(balls.owners[j]), 2.0)], **body)
+
+    def _walls(self, walls: Walls, stamp: Any) -> Iterator[SceneEntity]:
+        if walls.normal.shape[1] == 1:
+            return
+        for k, corners in space.faces(walls, self._low, self._high):
+            closed = corners if len(corners) == 2 else np.concatenate([corners, corners[:1]])
+            yield self._entity(f"wall {int(walls.number[k])}", stamp, lines=[self._line(_in_space(closed), _rgb(walls.owners[k]), 2.0)])
+
+    def _outlines(self, k: int, x: np.ndarray, stamp: Any) -> Iterator[SceneEntity]:
+        if self._team is None:
+            return
+        asked = [number for number in self._traced if k == 0 or self._moves[number]]
+        for number, found in zip(asked, outlines(self._team, asked, x[:, :2], self._low, self._high) if asked else (), strict=True):
+            shade = _rgb((int(self._team.owner[number]),))
+            yield self._entity(f"region {number}", stamp, lines=[self._line(_in_space(line), shade, 2.0) for line in found])
+
+    def _line(self, points: np.ndarray, shade: tuple[float, float, float], thickness: float, *, pairs: bool = False) -> Any:
+        from foxglove import messages
+
+        kind = messages.LinePrimitiveLineType.LineList if pairs else messages.LinePrimitiveLineType.LineStrip
+        places = [messages.Point3(x=px, y=py, z=pz) for px, py, pz in points.tolist()]
+        pose = messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0))
+        return messages.LinePrimitive(
+            type=kind, pose=pose, thickness=thickness, scale_invariant=True, points=places, color=_colour(shade, 0.9)
+        )
+
+    def _text(self, name: str, place: np.ndarray) -> Any:
+        from foxglove import messages
+
+        pose = messages.Pose(position=_vector(place), orientation=messages.Quaternion(w=1.0))
+        shade = _colour((0.1, 0.1, 0.1), 1.0)
+        return messages.TextPrimitive(pose=pose, billboard=True, font_size=14.0, scale_invariant=True, color=shade, text=name)
+
+
+def _rgb(owners: tuple[int, ...]) -> tuple[float, float, float]:
+    from matplotlib.colors import to_rgb
+
+    return to_rgb(colour(owners[0])) if len(owners) == 1 else KEEP_OUT
+
+
+def _colour(shade: tuple[float, float, float], alpha: float) -> Color:
+    from foxglove.messages import Color
+
+    return Color(r=shade[0], g=shade[1], b=shade[2], a=alpha)

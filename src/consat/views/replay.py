@@ -1,0 +1,256 @@
+"""A run as one HTML file that replays it offline: nothing is loaded, nothing is evaluated, everything lies inside.
+
+``replay.html`` is the page, ``replay.css`` its look, ``replay.js`` decodes the data and draws. The data is JSON; arrays are base64 of
+little-endian float32.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.colors import to_hex
+
+from consat import __version__
+from consat.errors import InvalidSettings, counted
+from consat.problem.team import Team
+from consat.results.result import Result
+from consat.views import space, words
+from consat.views.colours import classes
+from consat.views.figures import number, recorded, view
+from consat.views.outlines import MOST, outlines
+from consat.views.shapes import boxes, moves, shapes
+
+SCHEMA: Final = "consat.replay/1"
+MOST_NUMBERS: Final = 2_000_000
+"""Of a longer record some steps are replayed, evenly spread along what happens."""
+MOST_SHAPES: Final = 20_000
+MOST_OUTLINED: Final = 40
+"""Moments at which the boundaries of moving regions are traced."""
+SPREAD: Final = 200
+FEW: Final = 12
+"""Up to so many agents have colours of their own, as in ``replay.js``."""
+
+
+def save(result: Result, path: str | os.PathLike[str]) -> Path:
+    """Write the page.
+
+    Args:
+        result: of a run.
+        path: of the HTML file.
+
+    Raises:
+        InvalidSettings: nobody was recorded.
+    """
+    target = Path(path)
+    text = page(result)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def page(result: Result) -> str:
+    """The page as text; see `save`."""
+    if "position" not in result.data:
+        raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
+    files = resources.files("consat.views")
+    style, script, html = ((files / f"replay.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    summary = result.summary
+    status = summary["status"]
+    good = status == "satisfied"
+    policy = f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
+    count = summary["count"]
+    few = result.data.sizes["agent"] <= FEW
+    parts = {
+        "policy": policy,
+        "version": __version__,
+        "title": escape(f"{summary['scenario']}: {status}"),
+        "style": style,
+        "name": escape(str(summary["scenario"])),
+        "tone": "good" if good else "bad",
+        "sign": "✓" if good else "✗",
+        "status": escape(words.STATUS[status]),
+        "chart": escape(f"at the end {_said(summary['margin'])}"),
+        "agents": counted(count, "agent") if few else f"{counted(count, 'agent')}, the tightest first",
+        "scale": "" if few else _scale(result),
+        "scale_hidden": "hidden" if few else "",
+        "facts": "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in _facts(result)),
+        "data": data,
+        "script": script,
+    }
+    return re.sub(r"@(\w+)@", lambda found: parts[found[1]], html)
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _said(value: float | None) -> str:
+    return "none" if value is None else number(value)
+
+
+def _facts(result: Result) -> Iterator[tuple[str, str]]:
+    summary = result.summary
+    yield "verdict", words.VERDICT[summary["verdict"]]
+    lower, upper = summary.get("bounds") or (None, None)
+    if lower is not None and upper is not None:
+        yield (
+            "best possible",
+            f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
+        )
+    since = summary["satisfied_from"]
+    if since["round"] is not None:
+        yield "satisfied from", f"round {since['round']:.0f}"
+    elif since["time"] is not None:
+        yield "satisfied from", f"t = {number(since['time'])} s"
+    yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
+    for name, count in (("rounds", summary["rounds"]), ("messages", summary["messages"])):
+        if count is not None:
+            yield name, f"{count:,}"
+    for reason in result.reasons:
+        yield "in the way", reason
+
+
+def _scale(result: Result) -> str:
+    """The colours of margins as a picture."""
+    palette, edges = _palette(result)
+    wide = 100 / len(palette)
+    bars = "".join(f'<rect x="{wide * k:.2f}%" y="0" width="{wide:.2f}%" height="14" fill="{shade}"/>' for k, shade in enumerate(palette))
+    texts = "".join(f'<text x="{wide * (k + 1):.2f}%" y="27" text-anchor="middle">{number(edge)}</text>' for k, edge in enumerate(edges))
+    return f'<h2>margin (red: violated)</h2><svg role="img" aria-label="Colours of margins, from violated to satisfied">{bars}{texts}</svg>'
+
+
+def _palette(result: Result) -> tuple[list[str], list[float]]:
+    """The shades, from below the first edge to above the last, and the edges."""
+    palette, _, edges, _ = classes(result.data["agent_margin"].values[-1])
+    inside = [palette(k) for k in range(len(edges) - 1)]
+    every: list[Any] = [palette.get_under(), *inside, palette.get_over()]
+    return [to_hex(shade) for shade in every], [float(edge) for edge in edges]
+
+
+def _packed(values: np.ndarray, kind: str = "<f4") -> str:
+    with np.errstate(over="ignore"):
+        return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode()
+
+
+def document(result: Result) -> dict[str, Any]:
+    """What the page knows, as JSON can hold it (schema consat.replay/1).
+
+    ``x`` is (T, N, d) with d at most 3, ``agent_margin`` (T, N), ``margin`` and ``steps`` (T,); ``links`` (L, 2) int32; ``balls``,
+    ``walls`` and ``outlines`` are the regions; ``spread`` are moments, in samples, evenly spread along what happens.
+    """
+    data, summary, team = recorded(result), result.summary, None if "final_position" in result.data else result.team
+    clock = str(data["position"].dims[0])
+    x = data["position"].values[:, :, :3]
+    finite = np.flatnonzero(np.isfinite(x).all(axis=(1, 2)))
+    last = int(finite[-1]) if len(finite) else 0
+    chosen = _steps(x[: last + 1])
+    x = x[chosen]
+    dimension = x.shape[2]
+    low, high, found = _regions(team, x)
+    margin, agent_margin, steps = (data[name].values[chosen] for name in ("margin", "agent_margin", clock))
+    shades, edges = _palette(result)
+    bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
+    since = summary["satisfied_from"]["time" if clock == "time" else "round"]
+    return {
+        "schema": SCHEMA,
+        "name": summary["scenario"],
+        "unit": None if team is None else team.unit,
+        "clock": clock,
+        "dimension": dimension,
+        "ids": [str(name) for name in data["agent"].values],
+        "verdict": summary["verdict"],
+        "bounds": summary.get("bounds"),
+        "since": since,
+        "steps": _packed(steps),
+        "x": _packed(np.nan_to_num(x)),
+        "margin": _packed(margin),
+        "agent_margin": _packed(agent_margin),
+        "bound": None if bound is None else _packed(bound),
+        "links": _packed(team.links if team is not None and len(team.links) <= MOST_SHAPES else np.zeros((0, 2)), "<i4"),
+        "low": [round(float(value), 6) for value in low],
+        "high": [round(float(value), 6) for value in high],
+        "spread": [round(float(value), 3) for value in _spread(x, steps)],
+        "scale": {"edges": edges, "shades": shades},
+        **found,
+    }
+
+
+def _steps(x: np.ndarray) -> np.ndarray:
+    """Which steps are replayed."""
+    most = max(2, MOST_NUMBERS // max(1, x.shape[1] * x.shape[2]))
+    if len(x) <= most:
+        return np.arange(len(x))
+    return np.unique(np.round(_spread(x, np.arange(len(x)), most)).astype(int))
+
+
+def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray:
+    """(count,) moments from first to last, half by the way travelled, half by the clock."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(np.nan_to_num(x), axis=0), axis=(1, 2))))
+    clock = np.asarray(steps, dtype=float) - float(steps[0])
+    share = 0.6 * way / (way[-1] or 1.0) + 0.4 * clock / (clock[-1] or 1.0)
+    return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
+
+
+def _regions(team: Team | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
+    """The box to show, low and high, and the regions."""
+    dimension = x.shape[2]
+    if team is None or len(team.owner) > MOST_SHAPES:
+        low, high, _ = view(x, x[-1], None)
+        return low, high, {"balls": [], "walls": [], "outlines": []}
+    geometry = shapes(team)
+    balls, around = geometry.balls, [boxes(team)[:, :, :dimension]]
+    if team.dimension <= 3:
+        center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
+        fixed = np.concatenate([center - radius, center + radius], axis=1)
+        around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
+    low, high, _ = view(x, x[-1], None, np.concatenate(around))
+    told: list[Mapping[str, Any]] = [
+        {
+            "center": balls.center[k].tolist(),
+            "around": int(balls.around[k]),
+            "radius": float(balls.radius[k]),
+            "out": bool(balls.keeps_out[k]),
+            "owners": list(balls.owners[k]),
+        }
+        for k in range(len(balls.radius))
+        if team.dimension <= 3
+    ]
+    return low, high, {"balls": told, "walls": _walls(team, low, high), "outlines": _outlines(team, geometry.others, x, low, high)}
+
+
+def _walls(team: Team, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
+    """Half-spaces as polygons within the view, of a team in the plane as lines; those of a box are cut by each other."""
+    if team.dimension not in (2, 3):
+        return []
+    walls, beyond = shapes(team).walls, 10 * (high - low) * (team.dimension == 2)  # a reader may pan
+    return [
+        {"corners": np.round(corners, 6).tolist(), "normal": walls.normal[k].tolist(), "owners": list(walls.owners[k])}
+        for k, corners in space.faces(walls, low - beyond, high + beyond)
+    ]
+
+
+def _outlines(team: Team, numbers: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
+    """The boundaries of other ψ in the plane, at some moments where they move."""
+    if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+        return []
+    moving = moves(team)[numbers]
+    moments = np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int)) if moving.any() else np.array([len(x) - 1])
+    traced = [outlines(team, numbers.tolist(), x[moment], low, high) for moment in moments]
+    digits = max(0, 4 - int(np.floor(np.log10(float((high - low).max()) or 1.0))))
+    found: list[Mapping[str, Any]] = []
+    for k, constraint in enumerate(numbers.tolist()):
+        at = moments.tolist() if moving[k] else [0]
+        lines = [[np.round(line, digits).ravel().tolist() for line in each[k]] for each in (traced if moving[k] else traced[-1:])]
+        found.append({"at": at, "lines": lines, "owners": [int(team.owner[constraint])]})
+    return found

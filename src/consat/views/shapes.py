@@ -1,0 +1,169 @@
+"""The regions of library constraints as geometry: balls and half-spaces, each once however many agents share it.
+
+What other ψ look like is found by evaluating them, see `consat.views.figures.regions`; here stands what can be read off the parameters,
+for views of many agents, in space, and outside matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from consat.problem.family import Family
+from consat.problem.team import Team
+
+BALLS: Final[Mapping[str, bool]] = {"within": False, "outside": True, "near": False, "apart": True, "displacement": False}
+"""The kinds whose boundary is a ball, and whether it keeps its owner out."""
+WALLS: Final = ("halfspace", "box")
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """K balls; equal ones of several owners are one.
+
+    Attributes:
+        center: (K, d) where they are, relative to agent `around` where there is one.
+        around: (K,) the place in the team of the agent that they move with, or -1.
+        radius: (K,).
+        keeps_out: (K,) whether the owners must stay outside.
+        owners: of each the places of its owners, ascending.
+        number: (K,) the first of the constraints that each stands for.
+    """
+
+    center: np.ndarray
+    around: np.ndarray
+    radius: np.ndarray
+    keeps_out: np.ndarray
+    owners: tuple[tuple[int, ...], ...]
+    number: np.ndarray
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """(K, d) the centers, with the team at x (N, d)."""
+        return self.center + np.where(self.around[:, None] >= 0, x[self.around], 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """K half-spaces normal·x ≤ offset, as `Balls`.
+
+    Attributes:
+        normal: (K, d), of length 1, to the forbidden side.
+        offset: (K,).
+        owners: of each the places of its owners, ascending.
+        number: (K,) the first of the constraints that each stands for.
+    """
+
+    normal: np.ndarray
+    offset: np.ndarray
+    owners: tuple[tuple[int, ...], ...]
+    number: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """The geometry of a team's constraints.
+
+    Attributes:
+        balls: those of the kinds of `BALLS`.
+        walls: those of the kinds of `WALLS`.
+        others: (M',) constraints whose geometry cannot be read off, each different one once.
+    """
+
+    balls: Balls
+    walls: Walls
+    others: np.ndarray
+
+
+def shapes(team: Team) -> Shapes:
+    """The geometry of the constraints of a team."""
+    balls: dict[Hashable, list[Any]] = {}
+    walls: dict[Hashable, list[Any]] = {}
+    others: dict[Hashable, int] = {}
+    for key, family, k in _distinct(team):
+        number, owner = int(family.number[k]), int(family.owner[k])
+        given = {name: value[k] for name, value in family.parameters.items()}
+        if family.kind in BALLS and "radius" in given and family.sources is None:
+            center = given.get("center", given.get("vector", np.zeros(team.dimension)))
+            around = int(family.agents[k, 1]) if family.arity == 2 else -1
+            entry = balls.setdefault(key, [center, around, float(given["radius"]), BALLS[family.kind], [], number])
+            entry[4].append(owner)
+            entry[5] = min(entry[5], number)
+        elif family.kind in WALLS and (wall := _wall(given)) is not None:
+            entry = walls.setdefault(key, [*wall, [], number])
+            entry[2].append(owner)
+            entry[3] = min(entry[3], number)
+        else:
+            others[key] = min(others.get(key, number), number)
+    return Shapes(
+        Balls(
+            np.array([entry[0] for entry in balls.values()], dtype=float).reshape(-1, team.dimension),
+            np.array([entry[1] for entry in balls.values()], dtype=int),
+            np.array([entry[2] for entry in balls.values()], dtype=float),
+            np.array([entry[3] for entry in balls.values()], dtype=bool),
+            tuple(tuple(sorted(entry[4])) for entry in balls.values()),
+            np.array([entry[5] for entry in balls.values()], dtype=int),
+        ),
+        Walls(
+            np.array([entry[0] for entry in walls.values()], dtype=float).reshape(-1, team.dimension),
+            np.array([entry[1] for entry in walls.values()], dtype=float),
+            tuple(tuple(sorted(entry[2])) for entry in walls.values()),
+            np.array([entry[3] for entry in walls.values()], dtype=int),
+        ),
+        np.array(sorted(others.values()), dtype=int),
+    )
+
+
+def alike(team: Team) -> np.ndarray:
+    """(M,) for each constraint the first one that has the same region, wherever everybody is; itself, if it is the first."""
+    first: dict[Hashable, int] = {}
+    found = np.arange(len(team.owner))
+    for key, family, k in sorted(_distinct(team), key=lambda each: int(each[1].number[each[2]])):
+        found[family.number[k]] = first.setdefault(key, int(family.number[k]))
+    return found
+
+
+def moves(team: Team) -> np.ndarray:
+    """(M,) whether the region of a constraint moves with teammates."""
+    found = np.zeros(len(team.owner), dtype=bool)
+    for family in team.families:
+        found[family.number] = family.arity > 1
+    return found
+
+
+def boxes(team: Team) -> np.ndarray:
+    """(B, 2, d) the different boxes that agents must be in, low and high."""
+    lows, highs = (
+        {
+            int(owner): corner
+            for family in team.families
+            if family.kind == "box" and family.sources is None and side in family.parameters
+            for owner, corner in zip(family.owner, family.parameters[side], strict=True)
+        }
+        for side in ("low", "high")
+    )
+    both = [np.stack([lows[owner], highs[owner]]) for owner in sorted(lows.keys() & highs.keys())]
+    return np.unique(np.array(both, dtype=float).reshape(-1, 2, team.dimension), axis=0)
+
+
+def _distinct(team: Team) -> Iterator[tuple[Hashable, Family, int]]:
+    """Every constraint with a key that those with the same region share: function, parameters, and whom it reads besides its owner."""
+    for place, family in enumerate(team.families):
+        parameters = [np.ascontiguousarray(value) for _, value in sorted(family.parameters.items())]
+        for k in range(family.size):
+            reads = tuple(-1 if agent == family.owner[k] else int(agent) for agent in family.agents[k])
+            yield (place, reads, *(value[k].tobytes() for value in parameters)), family, k
+
+
+def _wall(given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float] | None:
+    """Normal and offset of a `consat.halfspace`, or of one side of a `consat.box`."""
+    if "normal" in given:
+        length = float(np.linalg.norm(given["normal"]))
+        return np.asarray(given["normal"]) / length, float(given["offset"]) / length
+    if "axis" in given and "high" in given:
+        return np.asarray(given["axis"]), float(given["axis"] @ given["high"])
+    if "axis" in given and "low" in given:
+        return -np.asarray(given["axis"]), -float(given["axis"] @ given["low"])
+    return None
