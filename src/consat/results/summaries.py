@@ -61,8 +61,11 @@ class RunSummary(TypedDict):
     result: NotRequired[str | None]
     seconds: NotRequired[dict[str, float]]
     route: NotRequired[str | None]
-    motion: NotRequired[dict[str, Any]]
-    verdicts: NotRequired[list[dict[str, Any]]]
+    motion: NotRequired[dict[str, Any] | None]
+    verdicts: NotRequired[list[dict[str, Any]] | None]
+    robots: NotRequired[dict[str, Any] | None]
+    obstacles: NotRequired[list[dict[str, Any]] | None]
+    restarts: NotRequired[dict[str, Any] | None]
 
 
 class SweepSummary(TypedDict):
