@@ -17,7 +17,8 @@ from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.result import RESULT, Result
-from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.preparation import Prepared, named, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.restarting import best_start
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
@@ -48,6 +49,7 @@ def run(
     rate: float | None = None,
     speed: float | None = None,
     auxiliary: float | None = None,
+    restarts: int = 1,
     record: bool | None = None,
     agents: Who = None,
     every: int = 1,
@@ -74,6 +76,8 @@ def run(
         rate: rounds a second, Hz, for a body that cannot jump; positions then follow estimates.
         speed: the most that such a body moves, length/s.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
+        restarts: runs from so many starts, of this seed and those after it, as one computation, and tells of the one that ends with the
+            largest margin. In rounds only.
         record: whether to keep all estimates and integral states; by default while they are few.
         agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
         every: each how manieth round, or sample of a flow, to record.
@@ -94,7 +98,7 @@ def run(
     given = {
         "protocol": protocol, "estimates": estimates, "seed": seed, "start": start, "smoothing": smoothing,
         "until": until, "rounds": rounds, "stop": stop, "loss": loss, "sleep": sleep, "rate": rate, "speed": speed,
-        "auxiliary": auxiliary, "record": record, "agents": agents, "every": every,
+        "auxiliary": auxiliary, "restarts": restarts, "record": record, "agents": agents, "every": every,
     }  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
@@ -155,23 +159,33 @@ def _start(
     settings = settings_of(scenario.settings, given, scenario.team)
     kind = settings.protocol.kind
     until, rounds, loss, sleep, rate, speed = (given[key] for key in ("until", "rounds", "loss", "sleep", "rate", "speed"))
+    restarts = given.get("restarts", 1)
+    if restarts < 1:
+        raise InvalidSettings(f"restarts is {restarts}, but must be at least 1: from how many starts to run")
     default = "never" if until is not None or rounds is not None else "converged" if kind == "max-min" else "satisfied"
     options: dict[str, Any] = {"stop": given["stop"] or default, "progress": progress}
     if jax.process_count() > 1 and (kind in FLOWS or (files is not None and files.checkpoints(about) is not None)):
         raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
+    more = told(scenario.team, settings.protocol.model_copy(update={"kind": named(scenario.settings, given)})) | {"restarts": None}
     keep = _Keep(given["agents"], given["record"], given["every"], files, about)
     if kind in FLOWS:
-        _refuse(f"protocol {kind} flows in continuous time; use until", rounds=rounds, loss=loss, sleep=sleep, rate=rate, speed=speed)
-        return _run(scenario, settings, full, keep, functools.partial(_flow, until=until, **options))
+        rounds_only = {"rounds": rounds, "loss": loss, "sleep": sleep, "rate": rate, "speed": speed, "restarts": restarts - 1}
+        _refuse(f"protocol {kind} flows in continuous time; use until", **rounds_only)
+        return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=until, **options))
     _refuse(f"protocol {kind} goes in rounds; use rounds", until=until)
     if (speed is not None and rate is None) or not all(value is None or value > 0 for value in (speed, rate)):
         raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
     if not (0 <= loss < 1 and 0 <= sleep < 1):
         raise InvalidSettings(f"loss is {loss} and sleep is {sleep}, but both must be probabilities below 1")
+    if restarts > 1:
+        _refuse("restarts are runs in one process of agents that are where they want to be", rate=rate, processes=jax.process_count() - 1)
+        found = best_start(scenario.team, settings, restarts, Weather(loss, sleep), rounds=rounds, stop=given["stop"])
+        settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
+        more |= {"restarts": found}
     weather = Weather(loss, sleep, settings.start.seed)
     body = None if rate is None else Body(rate, np.inf if speed is None else speed)
     simulate = functools.partial(_rounds, rounds=rounds, weather=weather, body=body, **options)
-    return _run(scenario, settings, full, keep, simulate)
+    return _run(scenario, settings, full, keep, more, simulate)
 
 
 def _as_data(value: Any) -> Any:
@@ -207,13 +221,18 @@ class _Keep:
 
 
 @float64
-def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simulate: Callable[..., Trace]) -> Result:
+def _run(
+    scenario: Scenario, settings: Settings, full: bool, keep: _Keep, more: Mapping[str, Any], simulate: Callable[..., Trace]
+) -> Result:
     team = scenario.team
     ready = Prepared.of(team, settings)
     options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
     trace = simulate(ready, **options)
     summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
-    summary["route"] = told(team, settings.protocol)["route"]
+    summary |= more
+    if trace.turned is not None:
+        over = f"the links form loops and had not satisfied the team after {trace.turned:.0f} rounds; it went over to a spanning tree"
+        summary |= {"route": "tree", "why": over}
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
@@ -230,5 +249,5 @@ def _rounds(on: Prepared, **options: Any) -> Trace:
     asked = on.settings.protocol
     return simulate_rounds(
         on.team, with_gains(ROUNDS[str(asked.kind)](), asked), on.copies, on.schedule.final, on.size, on.first(),
-        convex=on.convex, hopeless=on.hopeless, enough=on.enough, **options,
+        convex=on.convex, hopeless=on.hopeless, enough=on.enough, then=on.then, **options,
     )  # fmt: skip

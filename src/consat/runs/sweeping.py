@@ -20,16 +20,16 @@ from consat.central.certificate import bounds
 from consat.errors import InvalidSettings, shown
 from consat.estimates import Layout
 from consat.numerics import float64
-from consat.protocols import FLOWS, ROUNDS, with_gains
+from consat.protocols import FLOWS, ROUNDS
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
+from consat.runs.restarting import case_of
 from consat.runs.runner import run
 from consat.runs.summary import number, status_of
 from consat.scenario import Scenario, loads
 from consat.settings import Start
 from consat.simulate import Stop
-from consat.simulate.batch import Case, Lane, Outcome, like, simulate_batch
-from consat.simulate.kernel import Weather, world_of
-from consat.simulate.rounds import PATIENCE, Rules, longest_hold, stillness
+from consat.simulate.batch import Lane, Outcome, like, simulate_batch
+from consat.simulate.kernel import Weather
 from consat.teams.team import Team
 
 SCHEMA = "consat.sweep/1"
@@ -236,7 +236,7 @@ class _Asked:
         protocols = {}
         for k, combination in enumerate(combinations):
             kind = str(combination.ready.settings.protocol.kind)
-            case = self._case(combination)
+            case = case_of(combination.ready, Weather(*combination.weather), rounds=self.rounds, stop=self.stop)
             key = (kind, like(case))
             protocols[key] = ROUNDS[kind]()
             box = combination.ready.settings.start.box
@@ -258,25 +258,6 @@ class _Asked:
             for k, combination in enumerate(combinations)
             for n, seed in enumerate(seeds)
         ]
-
-    def _case(self, combination: _Combination) -> Case:
-        ready = combination.ready
-        asked, nu = ready.settings.protocol, ready.schedule.final
-        protocol = ROUNDS[str(asked.kind)]()
-        gains = {
-            key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None
-        }
-        loss, sleep = combination.weather
-        world = world_of(
-            ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks
-        )
-        default: Stop = "never" if self.rounds is not None else "converged" if asked.kind == "max-min" else "satisfied"
-        rules = Rules(
-            end=PATIENCE if self.rounds is None else self.rounds, stop=self.stop or default,
-            most=longest_hold(protocol, world), still=stillness(ready.size.length, ready.enough),
-            earliest=protocol.earliest(world.everyone), hopeless=ready.hopeless, enough=ready.enough,
-        )  # fmt: skip
-        return Case(world, gains, rules)
 
     def one_by_one(
         self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]
