@@ -43,6 +43,7 @@ class Trace:
         final: (N, d) everyone's last positions, where not all were recorded.
         violated: (M,) share of all steps, the start among them, at which each constraint was violated; NaN for those that are not watched,
             see `consat.simulate.violations`; None where nobody counted.
+        turned: the round after which the team went over from its links to a spanning tree, or None.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -70,6 +71,7 @@ class Trace:
     final: np.ndarray | None = None
     violated: np.ndarray | None = None
     file: Path | None = None
+    turned: float | None = None
     bound: np.ndarray | None = None
 
     @property
