@@ -17,6 +17,7 @@ from consat.estimates import Estimates, Layout
 from consat.numerics import float64
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.result import RESULT, Result
+from consat.runs.advice import around_loops
 from consat.runs.preparation import Prepared, named, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.restarting import best_start
 from consat.runs.summary import summarise
@@ -233,6 +234,7 @@ def _run(
     if trace.turned is not None:
         over = f"the links form loops and had not satisfied the team after {trace.turned:.0f} rounds; it went over to a spanning tree"
         summary |= {"route": "tree", "why": over}
+    summary["warnings"] += around_loops(summary["route"], trace)
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)
