@@ -13,7 +13,6 @@ Many teams run at once, as the clusters of one.
 from __future__ import annotations
 
 import argparse
-import functools
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -35,7 +34,7 @@ from consat.objective import Objective
 from consat.protocols.interior_point import InteriorPoint
 from consat.scale import scale
 
-TOGETHER = 125
+TOGETHER = 250
 """Teams that run at once."""
 ROUNDS = 80
 BOX = 8.0
@@ -68,6 +67,8 @@ class Weather(NamedTuple):
 
 
 WEATHERS = (Weather(), Weather(loss=0.3), Weather(loss=0.3, late=5), Weather(sleep=0.5, loss=0.2), Weather(loss=0.3, late=3, forget=0.02))
+
+LATEST = max(weather.late for weather in WEATHERS)
 
 
 class Counted(NamedTuple):
@@ -150,9 +151,9 @@ def together(number: int, dimension: int, count: int) -> Callable[[Weather], Cou
     best = np.full(count, np.inf)
     np.minimum.at(best, cluster, margins)
 
-    @functools.partial(jax.jit, static_argnames=("late",))
-    def run(first: Array, key: Array, late: int, rates: Array) -> Array:
-        """(ROUNDS, N) bounds; rates: of loss, sleep and forgetting."""
+    @jax.jit
+    def run(first: Array, key: Array, late: Array, rates: Array) -> Array:
+        """(ROUNDS, N) bounds; late: rounds at most; rates: of loss, sleep and forgetting."""
         loss, sleep, forget = rates
         blank, silence = interior.begin(first, gains), interior.silence()
 
@@ -183,7 +184,7 @@ def together(number: int, dimension: int, count: int) -> Callable[[Weather], Cou
         def newest(past: Any) -> Any:
             return jax.tree.map(lambda leaf: leaf[0], past)
 
-        past = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (late + 1, *leaf.shape)), silence)
+        past = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LATEST + 1, *leaf.shape)), silence)
         steps = jnp.arange(ROUNDS), jax.random.split(key, ROUNDS)
         return jax.lax.scan(turn, (blank, silence, past), steps)[1]
 
@@ -191,7 +192,7 @@ def together(number: int, dimension: int, count: int) -> Callable[[Weather], Cou
     def counted(weather: Weather) -> Counted:
         first = jnp.asarray(random.uniform(-BOX, BOX, (copies.count, dimension)))
         rates = jnp.asarray([weather.loss, weather.sleep, weather.forget])
-        bounds = np.asarray(run(first, jax.random.key(number), weather.late, rates)) * size.typical
+        bounds = np.asarray(run(first, jax.random.key(number), jnp.asarray(weather.late), rates)) * size.typical
         unit = np.maximum(1.0, np.abs(best))
         above = (bounds - best[cluster]) / unit[cluster]
         worst = np.full(count, -np.inf)
