@@ -119,10 +119,15 @@ class Case:
 
 
 def draw(shape: str, count: int, random: np.random.Generator) -> cs.Team:
+    """See `instance`."""
+    return cs.Team(*instance(shape, count, random), 2)
+
+
+def instance(shape: str, count: int, random: np.random.Generator, prefix: str = "") -> tuple[list[cs.Agent], list[tuple[str, str]]]:
     """Discs on some agents, a tether or a displacement along every link, around a random formation; noise and squeezed tethers spoil it."""
     places = random.uniform(-PLACES, PLACES, (count, 2))
     squeeze = random.uniform(0.05, 1.0)
-    ids = [f"a{i}" for i in range(count)]
+    ids = [f"{prefix}a{i}" for i in range(count)]
     parent = [i - 1 if shape == "line" else int(random.integers(max(0, i - REACH), i)) for i in range(1, count)]
     agents = []
     for i in range(count):
@@ -137,7 +142,7 @@ def draw(shape: str, count: int, random: np.random.Generator) -> cs.Team:
         if i in (0, count - 1) or random.random() < 0.4:
             own.append(cs.within((places[i] + random.normal(0, 0.5, 2)).tolist(), float(random.uniform(0.3, 0.8))))
         agents.append(cs.Agent(ids[i], own))
-    return cs.Team(agents, [(ids[j], ids[i]) for i, j in enumerate(parent, 1)], 2)
+    return agents, [(ids[j], ids[i]) for i, j in enumerate(parent, 1)]
 
 
 def case(shape: str, count: int, seed: int) -> tuple[Case, cs.Team, np.ndarray]:

@@ -63,10 +63,11 @@ Report = Callable[[str], None]
 
 
 class Condition(NamedTuple):
-    """Where estimates start (half the side of a box) and which part of the messages is lost."""
+    """Where estimates start (half the side of a box), which part of the messages is lost, and which part of the agents sleeps."""
 
     box: float
     loss: float
+    sleep: float = 0.0
 
 
 class Measured(NamedTuple):
@@ -122,12 +123,13 @@ class Stage:
     verdict: str = ""
 
     @classmethod
-    def of(cls, problem: Problem) -> Stage:
+    def of(cls, problem: Problem, *, optima: bool = True) -> Stage:
+        """Args: problem: what; optima: whether to find the best of each instance centrally."""
         team = problem.team
         copies, size = Estimates.of(team, "local"), scale(team)
         nu = Schedule.of(problem.smoothing or automatic(size)).final
         best, center, smooth = None, None, np.full(problem.seeds, np.nan)
-        if problem.convex:
+        if problem.convex and optima:
             optimum = max_min(team)
             best = np.asarray(cluster_margins(team, values_and_gradients(team, optimum.positions)[0], copies.cluster))
             center, smooth = _best_smooth(problem, copies.cluster, nu, optimum.positions)

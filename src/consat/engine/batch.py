@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.engine.chunks import CHUNK, NEVER, Ask, Chosen, Chunk, advance, start
+from consat.engine.chunks import NEVER, Ask, Chosen, Chunk, advance, start
 from consat.engine.round import Now, World
-from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally
+from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally, later
 from consat.numerics import float64, quick_compilation
 from consat.protocols import Rounds
+from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending
 
 LANES = 32
@@ -38,11 +40,27 @@ class Case:
         world: what does not change in a run.
         gains: fields of the protocol that differ between cases.
         rules: when a run ends.
+        then: how runs go on that go over to another layout of copies; None if none does.
     """
 
     world: World
     gains: Mapping[str, float]
     rules: Rules
+    then: Then | None = None
+
+
+class Then(NamedTuple):
+    """Another layout of copies.
+
+    Attributes:
+        before: the layout until then.
+        after: the layout from then on.
+        case: what is run from then on.
+    """
+
+    before: Estimates
+    after: Estimates
+    case: Case
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,18 +71,21 @@ class Lane:
         case: what is run.
         first: (C, d) first estimates.
         seed: of what goes wrong.
+        tally: of the rounds before, of a run that goes on; None of one that begins.
     """
 
     case: Case
     first: np.ndarray
     seed: int
+    tally: Tally | None = None
 
 
 class Outcome(NamedTuple):
-    """What became of a run: counts, everyone's last positions (N, d), and why it ended."""
+    """What became of a run: counts, everyone's last positions (N, d) and estimates (C, d), and why it ended."""
 
     tally: Tally
     positions: np.ndarray
+    estimates: np.ndarray
     ending: Ending
 
 
@@ -99,7 +120,22 @@ def simulate_batch(protocol: Rounds, lanes: Sequence[Lane], progress: Callable[[
             pool.outcomes[lane] = pool.outcome(lane)
             satisfied += pool.outcomes[lane].tally.margin > 0
         progress(len(pool.outcomes) / len(lanes), satisfied / max(len(pool.outcomes), 1))
+    _go_on(protocol, lanes, pool.outcomes)
     return [pool.outcomes[k] for k in range(len(lanes))]
+
+
+def _go_on(protocol: Rounds, lanes: Sequence[Lane], outcomes: dict[int, Outcome]) -> None:
+    """Runs whose time was not up go on over another layout of copies."""
+    groups: dict[Hashable, list[tuple[int, Lane]]] = defaultdict(list)
+    for k, lane in enumerate(lanes):
+        then, found = lane.case.then, outcomes[k]
+        if then is not None and found.ending == "out of time" and found.tally.done < lane.case.rules.end:
+            first = then.after.carried(then.before, found.estimates, found.positions)
+            tally = dataclasses.replace(found.tally, turned=found.tally.done, near=0)
+            groups[like(then.case)].append((k, Lane(then.case, first, later(lane.seed), tally)))
+    for some in groups.values():
+        ended = simulate_batch(protocol, [lane for _, lane in some])
+        outcomes |= {k: outcome for (k, _), outcome in zip(some, ended, strict=True)}
 
 
 class _Varied(NamedTuple):
@@ -165,6 +201,7 @@ class _Pool:
         self._state: Now | None = None
         self._varied: _Varied | None = None
         self._positions: np.ndarray | None = None
+        self._estimates: np.ndarray | None = None
 
     def fill(self) -> None:
         """Let waiting lanes start where there is place."""
@@ -183,8 +220,11 @@ class _Pool:
         self._state = now if self._state is None else choose(jnp.asarray(fresh), now, self._state)
         chunk = jax.tree.map(np.asarray, chunk)
         for place in places:
-            tally = self.tallies[self.running[place]] = Tally()
-            tally.add(_row(chunk, place))
+            lane = self.running[place]
+            before = self._lanes[lane].tally
+            tally = self.tallies[lane] = Tally() if before is None else before
+            if before is None:
+                tally.add(_row(chunk, place))
 
     def advance(self) -> list[int]:
         """A chunk of rounds of every lane; gives the lanes that have ended."""
@@ -192,19 +232,19 @@ class _Pool:
         for place, lane in self.running.items():
             tally, rules = self.tallies[lane], self._lanes[lane].case.rules
             number[place], streak[place], near[place] = tally.done, tally.streak, tally.near
-            rounds[place] = min(CHUNK, rules.end - tally.done)
+            rounds[place] = rules.chunk(tally)
             hold[place], most[place] = (HOLD, rules.most) if rules.stop == "satisfied" else (NEVER, NEVER)
             knowing[place] = ENOUGH[rules.stop]
         ask = Ask(*(jnp.asarray(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
         self._state, chunk = _compiled()[1](self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
-        chunk, self._positions = jax.tree.map(np.asarray, (chunk, self._state.body))
+        chunk, self._positions, self._estimates = jax.tree.map(np.asarray, (chunk, self._state.body, self._state.state.x))
         ended = []
         for place, lane in list(self.running.items()):
             tally, rules = self.tallies[lane], self._lanes[lane].case.rules
             if rounds[place]:
                 tally.add(_row(chunk, place))
             found = rules.ending(tally, functools.partial(self._positions.__getitem__, place))
-            if found is not None or tally.done >= rules.end:
+            if found is not None or tally.done >= rules.end or rules.turns(tally):
                 self.endings[lane] = found or "out of time"
                 ended.append(lane)
         return ended
@@ -214,7 +254,8 @@ class _Pool:
         place = next(place for place, other in self.running.items() if other == lane)
         del self.running[place]
         assert self._positions is not None
-        return Outcome(self.tallies[lane], self._positions[place].copy(), self.endings[lane])
+        assert self._estimates is not None
+        return Outcome(self.tallies[lane], self._positions[place].copy(), self._estimates[place].copy(), self.endings[lane])
 
 
 def _row(chunk: Chunk, place: int) -> Chunk:

@@ -43,6 +43,11 @@ class Checkpoint:
     taken_up: tuple[Mapping[str, np.ndarray], Mapping[str, Any]] | None = None
     _next: float = dataclasses.field(default_factory=time.monotonic)
 
+    @property
+    def turned(self) -> bool:
+        """Whether the run that is taken up had gone over to another layout of copies, see `consat.engine.rounds.Turn`."""
+        return self.taken_up is not None and self.taken_up[1]["tally"].get("turned") is not None
+
     def due(self) -> bool:
         """Whether the last one has become old."""
         return time.monotonic() >= self._next

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -38,6 +39,9 @@ PATIENCE = 2000
 """How many rounds a team may take when nobody says."""
 PATIENT = 1.5
 """Whether a team that stands still has no hope is asked again only when the run is so many times as long: the answer takes its time."""
+TURN, TURN_HOP = 10, 2
+"""A team that its links with their loops have not satisfied after so many rounds, and so many for each hop across it, goes over to a
+spanning tree. Measured: random geometric graphs, rings and lattices of 9 to 100 agents are satisfied over their links by then, or torn."""
 SETTLED = 1e-5
 """A team has settled when over a chunk no position moved by more than this fraction of the team's unit of length, …"""
 SETTLED_ALL_THE_SAME = 1e-7
@@ -64,6 +68,7 @@ class Tally(Steps):
         held_since: after how many rounds from that one on they did.
         worst_since: the least margin from that one on.
         asked: the round at which it was last asked whether there is hope.
+        turned: the round after which the team went over to a spanning tree, or None.
         violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
     """
 
@@ -83,6 +88,7 @@ class Tally(Steps):
     held_since: int = 0
     worst_since: float = np.inf
     violated: Any = 0
+    turned: int | None = None
 
     def add(self, chunk: Chunk) -> np.ndarray:
         """Count some rounds; gives their numbers."""
@@ -159,6 +165,7 @@ def simulate_rounds(
     checkpoint: Checkpoint | None = None,
     hopeless: Callable[[np.ndarray], bool] = lambda _: False,
     enough: Callable[[np.ndarray], bool] | None = None,
+    then: Estimates | None = None,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Trace:
     """Run a protocol in rounds.
@@ -182,11 +189,12 @@ def simulate_rounds(
         checkpoint: where to keep the state, and what to take up; nowhere and nothing if None.
         hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
         enough: says of (N, d) positions whether no formation is better by more than a tolerance.
+        then: the layout to which the team goes over where that of `copies` has not satisfied it in time, see `TURN`; None if it has none.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     weather = weather or Weather()
     choice = choice or Choice.of(team, copies, estimates=record)
-    most = HOLD
+    most, turn = HOLD, None
     engine: Engine
     if jax.process_count() > 1:
         from consat.engine.cluster import ManyProcesses
@@ -199,14 +207,54 @@ def simulate_rounds(
         most = longest_hold(protocol, world)
         ends = (HOLD, most) if stop == "satisfied" else None
         engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
+        if then is not None:
+            other = functools.partial(world_of, team, then, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
+            turn = Turn(lambda first: OneProcess(
+                protocol, other(), first, later(weather.seed), _over(choice, copies, then), ends, knowing=ENOUGH[stop]
+            ), copies, then)  # fmt: skip
     rules = Rules(
         end=least + PATIENCE if rounds is None else rounds, least=least, stop=stop, most=most, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
-        hopeless=hopeless, enough=enough,
+        hopeless=hopeless, enough=enough, turn=None if turn is None else turn_after(engine.world),
     )  # fmt: skip
     problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
-    course = _Course(team, engine, rules, choice, body)
+    course = _Course(team, engine, rules, choice, body, turn)
+    if turn is not None and checkpoint is not None and checkpoint.turned:
+        course.turn(np.zeros((turn.after.count, team.dimension)))
     return follow(course, copies, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=problem, progress=progress)
+
+
+class Turn(NamedTuple):
+    """How a run goes over to another layout of copies.
+
+    Attributes:
+        engine: who carries it out from then on, from first estimates.
+        before: the layout until then.
+        after: the layout from then on.
+    """
+
+    engine: Callable[[np.ndarray], OneProcess]
+    before: Estimates
+    after: Estimates
+
+
+def turn_after(world: World) -> int:
+    """The round after which a team that is not satisfied over its links goes over to a spanning tree."""
+    return TURN + TURN_HOP * world.everyone.hops
+
+
+def later(seed: int) -> int:
+    """The seed of what goes wrong from then on."""
+    return seed ^ 1
+
+
+def _over(choice: Choice, before: Estimates, after: Estimates) -> Choice:
+    """What is recorded from then on: the same copies, and of one that its holder no longer has the position that it was of."""
+    if choice.copies is None:
+        return choice
+    position = before.position[choice.copies]
+    rows, found = after.found(before.holder[choice.copies], position)
+    return dataclasses.replace(choice, copies=np.where(found, rows, after.own[position]))
 
 
 @dataclass(frozen=True)
@@ -222,6 +270,7 @@ class Rules:
         earliest: the round before which to stand still means nothing.
         hopeless: see `simulate_rounds`.
         enough: see `simulate_rounds`.
+        turn: the round after which a team that is not satisfied goes over to another layout; None if it has none.
     """
 
     end: int
@@ -232,6 +281,16 @@ class Rules:
     earliest: int = 0
     hopeless: Callable[[np.ndarray], bool] = lambda _: False
     enough: Callable[[np.ndarray], bool] | None = None
+    turn: int | None = None
+
+    def turns(self, tally: Tally) -> bool:
+        """Whether the team goes over to another layout now: the one that it has is not known to get anywhere."""
+        return self.turn is not None and tally.turned is None and tally.done >= self.turn and tally.streak == 0
+
+    def chunk(self, tally: Tally) -> int:
+        """How many rounds to go before the next look."""
+        looks = [at for at in (self.turn, self.least, self.end) if at is not None and at > tally.done]
+        return min(CHUNK, min(looks) - tally.done)
 
     def ending(self, tally: Tally, positions: Callable[[], np.ndarray]) -> Ending | None:
         """Why the run should end now, or None."""
@@ -245,7 +304,7 @@ class Rules:
             return "settled"
         if self.stop == "converged" and self.enough is not None and self.enough(positions()):
             return "settled"
-        if tally.done < self.earliest or tally.drift > self.still:
+        if tally.done - (tally.turned or 0) < self.earliest or tally.drift > self.still:
             return None
         if self.stop == "converged":
             return "settled"
@@ -264,13 +323,14 @@ class _Course:
         rules: when they end.
         choice: what is recorded.
         body: see `simulate_rounds`.
+        turn: see there; None if there is none.
     """
 
-    def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None) -> None:
+    def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None, turn: Turn | None) -> None:
+        self._turn = turn
         self._team, self._engine, self._rules, self._choice = team, engine, rules, choice
         self._period = None if body is None else 1.0 / body.rate
         self.tally, self.end = Tally(every=choice.every), rules.end
-        self.agree, self.positions = engine.agree, engine.positions
 
     def start(self) -> tuple[Any, Rows]:
         state, chunk = self._engine.start()
@@ -279,13 +339,27 @@ class _Course:
 
     def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
         done = self.tally.done
-        least = self._rules.least
-        streak = (self.tally.streak, self.tally.near) if done >= least else None
-        count = min(CHUNK, (least if done < least else self.end) - done)
-        state, chunk = self._engine.advance(state, done, count, streak, every)
+        streak = (self.tally.streak, self.tally.near) if done >= self._rules.least else None
+        state, chunk = self._engine.advance(state, done, self._rules.chunk(self.tally), streak, every)
         self._last = state
         rows = self._count(chunk, every)
-        return state, rows, self._rules.ending(self.tally, functools.partial(self.positions, state))
+        ending = self._rules.ending(self.tally, functools.partial(self.positions, state))
+        if ending is None and self._turn is not None and self._rules.turns(self.tally):
+            self.turn(self._turn.after.carried(self._turn.before, np.asarray(state.state.x), self.positions(state)))
+            state, _ = self._engine.start()
+            self.tally.turned, self.tally.near = self.tally.done, 0
+        return state, rows, ending
+
+    def turn(self, first: np.ndarray) -> None:
+        """Go over to the other layout, from first estimates, (C, d)."""
+        assert self._turn is not None, "of a team that has one"
+        self._engine = self._turn.engine(first)
+
+    def agree(self, stop: bool) -> bool:
+        return self._engine.agree(stop)
+
+    def positions(self, state: Any) -> np.ndarray:
+        return self._engine.positions(state)
 
     def _count(self, chunk: Chunk, every: int) -> Rows:
         numbers = self.tally.add(chunk)
@@ -314,6 +388,7 @@ class _Course:
             "messages": tally.messages,
             "floats_sent": tally.floats,
             **_known(tally),
+            "turned": tally.turned,
             "period": self._period,
             "heading": rows.heading,
             "motion": None if self._period is None else tally.motion(self._period) | driven(self._team, self._engine.world, self._last),

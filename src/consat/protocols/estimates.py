@@ -94,6 +94,25 @@ class Estimates:
         keys = self.holder.astype(np.int64) * count + self.position
         return np.searchsorted(keys, holder.astype(np.int64) * count + position).astype(np.int32)
 
+    def carried(self, before: Estimates, x: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """(C, d) first estimates of agents whose copies were laid out otherwise before: those that they held, and of what is new to them
+        their own place.
+
+        Args:
+            before: the layout until now.
+            x: (C', d) estimates until now.
+            place: (N, d) where the agents are.
+        """
+        rows, found = before.found(self.holder, self.position)
+        first = np.where(found[:, None], x[rows], place[self.holder])
+        first[self.own] = place
+        return first
+
+    def found(self, holder: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(…,) the rows of the copies (holder, position), and (…,) whether they exist."""
+        rows = np.minimum(self.rows(holder, position), self.count - 1)
+        return rows, (self.holder[rows] == holder) & (self.position[rows] == position)
+
     def ends(self) -> tuple[np.ndarray, np.ndarray, int]:
         """Both ends of every link of every row: (B,) receivers, in order, (B,) senders, and how many rows make a block, in which both are
         counted: agents' whole estimates where everyone holds everything, which makes one Laplacian for all positions; else single rows."""

@@ -45,6 +45,7 @@ class Trace:
             see `consat.engine.violations`; None where nobody counted.
         motion: what is said of a team that moves, see ``run --json``; None in continuous time, and where rounds take no time.
         heading: (T, N) of bodies, rad; None where they have none.
+        turned: the round after which the team went over from its links to a spanning tree, or None.
         file: where the record went as the run went on; the arrays above then hold its end only.
     """
 
@@ -72,6 +73,7 @@ class Trace:
     final: np.ndarray | None = None
     violated: np.ndarray | None = None
     file: Path | None = None
+    turned: float | None = None
     bound: np.ndarray | None = None
     motion: Mapping[str, Any] | None = None
     heading: np.ndarray | None = None

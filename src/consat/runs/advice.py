@@ -35,6 +35,18 @@ def warnings_of(team: Team, trace: Trace, nu: Nu, size: Scale, protocol: str) ->
     return found
 
 
+def around_loops(route: str | None, trace: Trace) -> list[str]:
+    """Of a run over links with loops that had not come to rest when its time was up, with some constraint violated."""
+    if route != "links" or trace.ending != "out of time" or trace.satisfied_from is not None:
+        return []
+    what = (
+        f"What agents tell each other went round loops of links and had not come to rest after {trace.steps[-1]:.0f} rounds: the team may "
+        "be torn, or the loops do not converge. What would help: fewer links, so that a spanning tree is narrow enough (consat check says "
+        "how narrow that is), or --protocol admm."
+    )
+    return [what]
+
+
 def _flow(trace: Trace, nu: Nu) -> str:
     alpha, beta = float(nu.alpha), float(nu.beta)
     went = "diverged" if trace.ending == "diverged" else "became too stiff to follow"

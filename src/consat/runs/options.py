@@ -63,6 +63,7 @@ class Options:
     robots: Robots | None = None
     wind: tuple[float, ...] = ()
     noise: float = 0.0
+    restarts: int = 1
 
     @property
     def data(self) -> dict[str, Any]:
@@ -91,6 +92,7 @@ class Options:
     def require_flow(self, kind: str, team: Team) -> None:
         """Raises: InvalidSettings: there is something that continuous time does not know."""
         given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "rate", "speed", "robots", "wind", "noise")}
+        given["restarts"] = self.restarts - 1
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
             raise InvalidSettings(message)
@@ -119,6 +121,12 @@ class Options:
 
     def pace(self, kind: str, team: Team) -> Pace:
         """How rounds follow one another. Raises: InvalidSettings: what is said of it does not fit together."""
+        if self.restarts < 1:
+            raise InvalidSettings(f"restarts is {self.restarts}, but must be at least 1: from how many starts to run")
+        if self.restarts > 1 and (self.rate is not None or team.moves or self.robots is not None):
+            raise InvalidSettings(
+                "restarts are of agents that are where they want to be; rate, robots and moving constraints mean nothing there"
+            )
         rate = RATE if self.rate is None and (team.moves or self.robots is not None) else self.rate
         if self.robots is None and (self.wind or self.noise):
             raise InvalidSettings("wind and noise mean something to robots only; give robots, too")

@@ -71,6 +71,12 @@ def why_admm(team: Team, layout: Layout) -> str | None:
     return None
 
 
+def named(asked: Settings, given: Options) -> str | None:
+    """The protocol that somebody names, or whose gains are given; None where the structure of the team decides."""
+    tuned = "admm" if asked.protocol.penalty is not None or asked.protocol.relaxation is not None else None
+    return given.protocol or asked.protocol.kind or tuned
+
+
 def settings_of(asked: Settings, given: Options, team: Team) -> Settings:
     """What the scenario asks for, and `given` overrides; the default protocol is that whose gains are given, or that of the team.
 
@@ -79,8 +85,7 @@ def settings_of(asked: Settings, given: Options, team: Team) -> Settings:
     """
     start, seed = given.start, given.seed
     estimates = given.estimates or asked.protocol.estimates
-    tuned = "admm" if asked.protocol.penalty is not None or asked.protocol.relaxation is not None else None
-    kind = given.protocol or asked.protocol.kind or tuned or default_protocol(team, estimates)
+    kind = named(asked, given) or default_protocol(team, estimates)
     settings = asked.model_copy(
         update={
             "start": Start(box=asked.start.box if start is None else start, seed=asked.start.seed if seed is None else seed),
@@ -105,7 +110,8 @@ def way_of(team: Team, kind: str, layout: Layout) -> Way:
 
 
 def told(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
-    """Which protocol runs, along what copies travel, and why: of ``run --json`` and ``check --json``."""
+    """Which protocol runs, along what copies travel, and why: of ``run --json`` and ``check --json``. `asked`: whose kind is None
+    where nobody names one."""
     kind = asked.kind or default_protocol(team, asked.estimates)
     why = why_admm(team, asked.estimates) if asked.kind is None else None
     if kind not in PAIRED:
@@ -120,6 +126,7 @@ class Prepared(NamedTuple):
     Attributes:
         team: the team.
         copies: the layout of estimates.
+        then: the layout to which the team goes over if that does not satisfy it; None if there is none.
         schedule: of ν.
         size: the team's natural size.
         settings: what holds.
@@ -127,6 +134,7 @@ class Prepared(NamedTuple):
 
     team: Team
     copies: Estimates
+    then: Estimates | None
     schedule: Schedule
     size: Scale
     settings: Settings
@@ -136,7 +144,11 @@ class Prepared(NamedTuple):
         """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
         size = scale(team)
         schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-        return cls(team, copies_of(team, settings.protocol), schedule, size, settings)
+        kind, layout = str(settings.protocol.kind), settings.protocol.estimates
+        if kind not in PAIRED:
+            return cls(team, Estimates.of(team, layout), None, schedule, size, settings)
+        way = way_of(team, kind, layout)
+        return cls(team, way.copies, way.then, schedule, size, settings)
 
     def first(self, start: Start | None = None, drive: Drive | None = None) -> np.ndarray:
         """(C, d) first estimates, drawn as the settings say, or otherwise; drive: robots, which do not start on top of one another."""

@@ -25,8 +25,10 @@ from consat.protocols.estimates import Estimates, Layout
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
 from consat.robots.description import asked
+from consat.runs.advice import around_loops
 from consat.runs.options import Options
-from consat.runs.preparation import Prepared, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.preparation import Prepared, named, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.restarting import best_start
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Settings, Smoothing
@@ -52,6 +54,7 @@ def run(
     wind: Sequence[float] = (),
     noise: float = 0.0,
     auxiliary: float | None = None,
+    restarts: int = 1,
     record: bool | None = None,
     agents: Who = None,
     every: int = 1,
@@ -83,6 +86,8 @@ def run(
         wind: (d,) velocity of the air, m/s, for robots.
         noise: the most that a robot's measured position is wrong by, m.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
+        restarts: runs from so many starts, of this seed and those after it, as one computation, and tells of the one that ends with the
+            largest margin. In rounds only.
         record: whether to keep all estimates and integral states; by default while they are few.
         agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
         every: each how manieth round, or sample of a flow, to record.
@@ -103,7 +108,7 @@ def run(
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
-        wind=tuple(map(float, wind)), noise=noise,
+        wind=tuple(map(float, wind)), noise=noise, restarts=restarts,
     )  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
@@ -160,18 +165,25 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
     settings = settings_of(scenario.settings, options, team)
     kind = str(settings.protocol.kind)
     if jax.process_count() > 1:
-        _require_simple(kind, team, files is not None and files.checkpoints(about) is not None)
+        _require_simple(kind, team, options, files is not None and files.checkpoints(about) is not None)
+    more = told(team, settings.protocol.model_copy(update={"kind": named(scenario.settings, options)})) | {"restarts": None}
     keep = _Keep(options, files, about)
     how: dict[str, Any] = {"stop": options.stop_for(kind), "progress": progress}
     if kind in FLOWS:
         options.require_flow(kind, team)
-        return _run(scenario, settings, full, keep, functools.partial(_flow, until=options.until, **how))
+        return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=options.until, **how))
     pace, weather = options.pace(kind, team), options.weather(settings.start.seed)
-    return _run(scenario, settings, full, keep, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
+    if options.restarts > 1:
+        found = best_start(team, settings, options)
+        settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
+        weather, more = options.weather(found["seed"]), more | {"restarts": found}
+    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
 
 
-def _require_simple(kind: str, team: Team, checkpoints: bool) -> None:
+def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """What several processes can do."""
+    if options.restarts > 1 or options.robots is not None:
+        raise InvalidSettings("several processes run points, and from one start; use one process for robots and restarts")
     if kind in FLOWS or checkpoints:
         raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
     if team.moves:
@@ -196,13 +208,19 @@ class _Keep:
 
 
 @float64
-def _run(scenario: Scenario, settings: Settings, full: bool, keep: _Keep, simulate: Callable[..., Trace]) -> Result:
+def _run(
+    scenario: Scenario, settings: Settings, full: bool, keep: _Keep, more: Mapping[str, Any], simulate: Callable[..., Trace]
+) -> Result:
     team = scenario.team
     ready = Prepared.of(team, settings)
     options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
     trace = simulate(ready, **options)
     summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
-    summary["route"] = told(team, settings.protocol)["route"]
+    summary |= more
+    if trace.turned is not None:
+        over = f"the links form loops and had not satisfied the team after {trace.turned:.0f} rounds; it went over to a spanning tree"
+        summary |= {"route": "tree", "why": over}
+    summary["warnings"] += around_loops(summary["route"], trace)
     machines = keep.asked.robots
     summary |= {"robots": None, "obstacles": None} if machines is None else {key: machines.data[key] for key in ("robots", "obstacles")}
     if keep.files is not None and jax.process_index() == 0:
@@ -222,5 +240,6 @@ def _rounds(on: Prepared, **options: Any) -> Trace:
     return simulate_rounds(
         on.team, with_gains(ROUNDS[str(gains.kind)](), gains), on.copies, on.schedule.final, on.size,
         on.first(drive=None if body is None else body.drive),
-        convex=on.convex, hopeless=on.hopeless, enough=on.enough, **options,
+        convex=on.convex, hopeless=on.hopeless, enough=on.enough,
+        then=None if on.team.moves or (body is not None and body.drive is not None) else on.then, **options,
     )  # fmt: skip

@@ -18,17 +18,17 @@ import numpy as np
 from consat import __version__
 from consat.certify.certificate import bounds
 from consat.engine import Stop
-from consat.engine.batch import Case, Lane, Outcome, like, simulate_batch
-from consat.engine.round import Weather, world_of
-from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness
+from consat.engine.batch import Lane, Outcome, like, simulate_batch
+from consat.engine.round import Weather
 from consat.errors import InvalidSettings, shown
 from consat.numerics import float64
 from consat.problem.team import Team
-from consat.protocols import FLOWS, ROUNDS, with_gains
+from consat.protocols import FLOWS, ROUNDS
 from consat.protocols.estimates import Layout
 from consat.results.summaries import SweepSummary
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
+from consat.runs.restarting import case_of
 from consat.runs.runner import run
 from consat.runs.summary import number, status_of
 from consat.scenario import Scenario, loads
@@ -239,7 +239,7 @@ class _Asked:
         protocols = {}
         for k, combination in enumerate(combinations):
             kind = str(combination.ready.settings.protocol.kind)
-            case = self._case(combination)
+            case = case_of(combination.ready, Weather(*combination.weather), self.options)
             key = (kind, like(case))
             protocols[key] = ROUNDS[kind]()
             box = combination.ready.settings.start.box
@@ -261,24 +261,6 @@ class _Asked:
             for k, combination in enumerate(combinations)
             for n, seed in enumerate(seeds)
         ]
-
-    def _case(self, combination: _Combination) -> Case:
-        ready = combination.ready
-        asked, nu = ready.settings.protocol, ready.schedule.final
-        protocol = ROUNDS[str(asked.kind)]()
-        gains = {
-            key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None
-        }
-        loss, sleep = combination.weather
-        world = world_of(
-            ready.team, ready.copies, nu, ready.size, convex=ready.convex, weather=Weather(loss, sleep), body=None, speaks=protocol.speaks
-        )
-        rules = Rules(
-            end=PATIENCE if self.options.rounds is None else self.options.rounds, stop=self.options.stop_for(str(asked.kind)),
-            most=longest_hold(protocol, world), still=stillness(ready.size.length, ready.enough),
-            earliest=protocol.earliest(world.everyone), hopeless=ready.hopeless, enough=ready.enough,
-        )  # fmt: skip
-        return Case(world, gains, rules)
 
     def one_by_one(
         self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]

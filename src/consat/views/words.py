@@ -72,6 +72,11 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     lower, upper = summary.get("bounds") or (None, None)
     if lower is not None and upper is not None:
         yield "best possible", f"between {_number(lower)} and {_number(upper)}, proven"
+    restarts = summary.get("restarts")
+    if restarts is not None:
+        yield "best of", f"{counted(restarts['count'], 'start')}; {restarts['satisfied']} of them end with every constraint satisfied"
+    if summary["status"] == "not-converged" and summary["verdict"] == "undecided" and summary["margin"] is not None:
+        yield "violation", "the least found, not proven to be the least possible"
     since = summary["satisfied_from"]
     if since["time"] is not None:
         yield "satisfied from", f"t = {_number(since['time'])} s"
@@ -127,7 +132,11 @@ def _advice(summary: Mapping[str, Any]) -> str | None:
         return None
     settled = summary.get("ending") == "settled"
     if summary["protocol"] == BEST:
-        return "other starts (--seed) may end better: nothing proves that this is the best" if settled else "give it more rounds (--rounds)"
+        return (
+            "other starts (--restarts 20) may end better: nothing proves that this is the best"
+            if settled
+            else "give it more rounds (--rounds)"
+        )
     best = f"protocol {BEST} (--protocol {BEST}) goes on until the margin is the best possible"
     return best if settled else f"{best}; --stop converged, until the team has settled"
 

@@ -526,6 +526,13 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
 
     A ψ that is not quadratic stands in by its tangent, which is above it everywhere if it is concave. So that no direction is flat, every
     agent adds ε w (R² − ‖x_i‖²), w being its Σλ or `IDLE`, which is not negative in the region of radius R around the team's middle.
+
+    Rounding is outward. Sums and eliminations of positive definite systems are backward stable: what is computed is exact for a matrix, a
+    vector and a constant whose entries are off by at most `eps` of the terms that were added up in them (Higham, Accuracy and Stability of
+    Numerical Algorithms, sections 10.1 and 14.4). That moves a quadratic at z by at most eps (|c| + |e|ᵀ|z| + ½ |z|ᵀ|L||z|). Every agent
+    adds it for its own terms and for every quadratic that it solves or passes on, with |z| at its estimates and at the maximum that it
+    finds; farther away the quadratic has fallen by more than that. ψ and its slope are off by what rounding a position, as far out as the
+    team's middle, does to them. Beside that, formations within half of R have at least ¾ `SLACK` in hand.
     """
     n, d, count = y.shape
     size, (g, p, _) = n * d, shared.shape
@@ -540,7 +547,8 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
     bent = times(matrix, flat)
     vector, constant = slope + bent, value - jnp.sum(slope * flat + 0.5 * flat * bent, axis=0)
     eps = 8.0 * size * jnp.finfo(y.dtype).eps
-    sizes = jnp.abs(multiplier * psi).sum(axis=0) + jnp.sum(jnp.abs(slope * flat) + flat**2 * jnp.abs(matrix).sum(axis=1), axis=0)
+    steep, far = jnp.abs(slope), jnp.abs(flat) + jnp.tile(lanes.units.reach + jnp.abs(lanes.units.center) / lanes.units.length, n)[:, None]
+    sizes = jnp.abs(multiplier * psi).sum(axis=0) + jnp.sum((steep + times(jnp.abs(matrix), jnp.abs(flat))) * far, axis=0)
     reach = REGION * lanes.units.reach
     curve = SLACK / reach**2 * jnp.where(used.any(axis=0), weight, IDLE)
     own = (jnp.arange(size) < d)[:, None]
@@ -557,7 +565,9 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
     mass = weight + jnp.sum(jnp.where(have, inbox.weight, 0.0), axis=0)
     found, fine = solve(total, forces[:, None])
     gain = 0.5 * jnp.sum(forces * found[:, 0], axis=0)
-    bound = (height + gain + error + eps * (jnp.abs(height) + jnp.abs(gain))) / jnp.where(mass > 0, mass, 1.0)
+    away = jnp.abs(flat) + jnp.where(fine, jnp.abs(found[:, 0]), 0.0)
+    error += eps * (jnp.abs(height) + jnp.sum(away * (jnp.abs(forces) + 0.5 * times(jnp.abs(total), away)), axis=0))
+    bound = (height + gain + error) / jnp.where(mass > 0, mass, 1.0)
     bound = jnp.where(fine & (missing == 0) & (mass > 0) & jnp.isfinite(bound), bound, jnp.inf)
 
     left, e, gain, fine = reduced(total, forces, places)

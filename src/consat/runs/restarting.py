@@ -1,0 +1,71 @@
+"""Runs of one team from many starts as one computation, and the best of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from consat.engine.batch import Case, Lane, Then, simulate_batch
+from consat.engine.round import Weather, World, world_of
+from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness, turn_after
+from consat.numerics import float64
+from consat.problem.team import Team
+from consat.protocols import ROUNDS, with_gains
+from consat.protocols.estimates import Estimates
+from consat.runs.options import Options
+from consat.runs.preparation import Prepared
+from consat.runs.summary import number
+from consat.settings import Settings, Start
+
+
+def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
+    """What runs of one team in rounds share, for `consat.engine.batch`.
+
+    Args:
+        ready: the team and its settings.
+        weather: of every run; each has a seed of its own.
+        options: how long they go on.
+    """
+    asked, nu = ready.settings.protocol, ready.schedule.final
+    protocol = ROUNDS[str(asked.kind)]()
+    gains = {key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None}
+
+    def world(copies: Estimates) -> World:
+        return world_of(ready.team, copies, nu, ready.size, convex=ready.convex, weather=weather, body=None, speaks=protocol.speaks)
+
+    along = world(ready.copies)
+    rules = Rules(
+        end=PATIENCE if options.rounds is None else options.rounds, stop=options.stop_for(str(asked.kind)),
+        most=longest_hold(protocol, along), still=stillness(ready.size.length, ready.enough),
+        earliest=protocol.earliest(along.everyone), hopeless=ready.hopeless, enough=ready.enough,
+    )  # fmt: skip
+    if ready.then is None:
+        return Case(along, gains, rules)
+    after = Case(world(ready.then), gains, rules)
+    return Case(along, gains, dataclasses.replace(rules, turn=turn_after(along)), Then(ready.copies, ready.then, after))
+
+
+@float64
+def best_start(team: Team, settings: Settings, options: Options) -> dict[str, Any]:
+    """The start from which a team ends with the largest margin: what it finds is found, not proven.
+
+    Args:
+        team: the team.
+        settings: what holds; their seed is the first.
+        options: how long runs go on, what gets lost, and from how many seeds, one after the other, they start.
+
+    Returns:
+        ``restarts`` of ``consat run --json``: how many, the best seed (of equals the first), how many satisfied every constraint, and the
+        last margin from each seed, null where it is no finite number.
+    """
+    ready, start = Prepared.of(team, settings), settings.start
+    count, weather = options.restarts, Weather(options.loss, options.sleep)
+    case = case_of(ready, weather, options)
+    seeds = range(start.seed, start.seed + count)
+    lanes = [Lane(case, ready.first(Start(box=start.box, seed=seed)), seed) for seed in seeds]
+    outcomes = simulate_batch(ROUNDS[str(settings.protocol.kind)](), lanes)
+    margins = np.array([outcome.tally.margin for outcome in outcomes])
+    best = int(np.argmax(np.where(np.isnan(margins), -np.inf, margins)))
+    return {"count": count, "seed": seeds[best], "satisfied": int(np.sum(margins > 0)), "margins": [number(margin) for margin in margins]}
