@@ -37,11 +37,11 @@ def conditions(
     if wind > 0.0 and _drifts(drive, wind):
         broken.append(f"wind: {wind:g} m/s moves robots by what no command asked for")
     pace, size = np.asarray(model.pace(count)), drive.size
-    least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(longest_halt(model, count)) + 2.0 * drive.noise)
+    least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(longest_halt(model, count, dt)) + 2.0 * drive.noise)
     if drive.sensing is not None and drive.sensing < least:
         broken.append(f"sensing: the range is {drive.sensing:g} m, but must be {least:.4g} m")
     place = model.place(state)
-    if model.inertial and bool(jnp.any(jnp.linalg.norm(model.stop(state) - place, axis=1) > 0.0)):
+    if model.inertial and bool(jnp.any(jnp.linalg.norm(model.stop(state, dt) - place, axis=1) > 0.0)):
         broken.append("start: robots must be at rest")
     touching = _overlaps(drive, np.asarray(place))
     if touching:

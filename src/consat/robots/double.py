@@ -56,10 +56,13 @@ class Double:
     def heading(self, state: DoubleState) -> Array:
         return jnp.zeros(len(state.position))
 
-    def stop(self, state: DoubleState) -> Array:
-        """p + v‖v‖/2A: braking is along the velocity."""
+    def stop(self, state: DoubleState, dt: float) -> Array:
+        """Braking is along the velocity: (s² − r²)/2A in whole steps, and r dt/2 in the last, which takes away what is left, r < A dt."""
         speed = jnp.linalg.norm(state.velocity, axis=1)
-        return state.position + state.velocity * (speed / (2.0 * each(self.acceleration, len(speed))))[:, None]
+        limit = each(self.acceleration, len(speed))
+        left = speed - limit * dt * jnp.floor(speed / (limit * dt))
+        way = (speed**2 - left**2) / (2.0 * limit) + 0.5 * dt * left
+        return state.position + state.velocity * (way / jnp.where(speed > 0.0, speed, 1.0))[:, None]
 
     def size(self, count: int, dt: float) -> Array:
         return each(self.radius, count)
@@ -90,27 +93,29 @@ class Double:
         old, new = along(normals, state.velocity), along(normals, after.velocity)
         turns = (old < 0.0) & (new > 0.0)
         dip = along(normals, state.position) - jnp.where(turns, 0.5 * dt * old**2 / jnp.where(turns, new - old, 1.0), 0.0)
-        end = jnp.minimum(along(normals, after.position), along(normals, self.stop(after)))
+        end = jnp.minimum(along(normals, after.position), along(normals, self.stop(after, dt)))
         return jnp.where(turns, jnp.minimum(dip, end), end)
 
     def rows(self, state: DoubleState, normals: Array, least: Array, dt: float) -> Array:
-        """With w the next velocity and s the largest that can be reached, n·p' + min(0, n·w) s/2A bounds what halting needs from below."""
+        """With w the next velocity, n·p' + min(0, n·w) c is a bound from below on where a halt leads, where c is the largest ratio of the
+        way of a halt to the speed, up to the largest speed that can be reached: s/2A + A dt²/8s, or dt/2 where that is more."""
         count = len(state.velocity)
         _, reachable = self.reach(state, dt)
         top = jnp.minimum(self.pace(count), jnp.linalg.norm(state.velocity, axis=1) + reachable)
-        halting = 0.5 * dt + top / (2.0 * each(self.acceleration, count))
+        limit = each(self.acceleration, count)
+        halting = 0.5 * dt + jnp.maximum(0.5 * dt, top / (2.0 * limit) + limit * dt**2 / (8.0 * top))
         rest = least - along(normals, state.position + 0.5 * dt * state.velocity)
         return rest / jnp.where(rest > 0.0, 0.5 * dt, halting[:, None])
 
     def farthest(self, state: DoubleState, command: Array, dt: float) -> Array:
         after = self.step(state, command, dt)
         top = jnp.maximum(jnp.linalg.norm(state.velocity, axis=1), jnp.linalg.norm(after.velocity, axis=1))
-        return jnp.maximum(dt * top, jnp.linalg.norm(self.stop(after) - state.position, axis=1))
+        return jnp.maximum(dt * top, jnp.linalg.norm(self.stop(after, dt) - state.position, axis=1))
 
     def bounded(self, slack: Array, dt: float) -> Array:
-        """The positive root of s dt + s²/2A = slack."""
+        """The positive root of s dt + s²/2A + A dt²/8 = slack."""
         limit = each(self.acceleration, len(slack))
-        finite = jnp.minimum(slack, LARGEST)
+        finite = jnp.clip(slack - limit * dt**2 / 8.0, 0.0, LARGEST)
         return limit * (jnp.sqrt(dt**2 + 2.0 * finite / limit) - dt)
 
     def approach(self, distance: Array, dt: float) -> Array:

@@ -183,7 +183,7 @@ class Drive:
         model, dt, size = self.model, self.dt, jnp.asarray(self.size)
         true = model.place(state)
         place = true if measured is None else measured
-        stop = place + (model.stop(state) - true) if model.inertial else None
+        stop = place + (model.stop(state, self.dt) - true) if model.inertial else None
         top = model.pace(self.count)
         known, around = near(memory.known, place, self.neighbours, self.range)
         memory = self._looked_at(state, memory, around)
@@ -294,14 +294,15 @@ def _sizes(drive: Drive) -> tuple[np.ndarray, float]:
         if drive.sensing is not None:
             return size, drive.sensing
         look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
-        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count)))
+        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count, dt)))
 
 
-def longest_halt(model: Model[Any], count: int) -> np.ndarray:
+def longest_halt(model: Model[Any], count: int, dt: float) -> np.ndarray:
     """(N,) the way that a halt from full speed takes, m."""
     if not model.inertial:
         return np.zeros(count)
-    return np.asarray(model.pace(count)) ** 2 / (2.0 * np.asarray(model.braking(count)))
+    pace, braking = np.asarray(model.pace(count)), np.asarray(model.braking(count))
+    return pace**2 / (2.0 * braking) + np.where(np.isfinite(braking), braking, 0.0) * dt**2 / 8.0
 
 
 def _row(rows: Array, index: Array) -> Array:

@@ -66,8 +66,8 @@ class Fleet:
     def heading(self, state: tuple[Any, ...]) -> Array:
         return self._joined([model.heading(part) for model, part in zip(self.models, state, strict=True)])
 
-    def stop(self, state: tuple[Any, ...]) -> Array:
-        return self._joined([model.stop(part) for model, part in zip(self.models, state, strict=True)])
+    def stop(self, state: tuple[Any, ...], dt: float) -> Array:
+        return self._joined([model.stop(part, dt) for model, part in zip(self.models, state, strict=True)])
 
     def velocity(self, state: tuple[Any, ...], command: Array) -> Array:
         return self._mapped(lambda model, part, rows: model.velocity(part, self._own(model, part, command[rows])), state)

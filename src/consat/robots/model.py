@@ -62,8 +62,8 @@ class Model(Protocol, Generic[S]):
     def heading(self, state: S) -> Array:
         """(N,) angle of the body in the plane, for drawings."""
 
-    def stop(self, state: S) -> Array:
-        """(N, d) where `place` comes to rest if the robot halts from now on."""
+    def stop(self, state: S, dt: float) -> Array:
+        """(N, d) where `place` comes to rest if the robot halts from now on, in steps of `dt`."""
 
     def size(self, count: int, dt: float) -> Array:
         """(N,) radius of a disc around `place` that holds the body all through a step of `dt` whose ends the filter has checked."""

@@ -53,7 +53,7 @@ class Point:
     def heading(self, state: PointState) -> Array:
         return jnp.zeros(len(state.position))
 
-    def stop(self, state: PointState) -> Array:
+    def stop(self, state: PointState, dt: float) -> Array:
         return state.position
 
     def size(self, count: int, dt: float) -> Array:

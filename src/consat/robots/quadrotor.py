@@ -95,8 +95,8 @@ class Quadrotor:
     def heading(self, state: QuadrotorState) -> Array:
         return jnp.arctan2(state.attitude[:, 1, 0], state.attitude[:, 0, 0])
 
-    def stop(self, state: QuadrotorState) -> Array:
-        return self.outer.stop(state.reference)
+    def stop(self, state: QuadrotorState, dt: float) -> Array:
+        return self.outer.stop(state.reference, dt)
 
     def size(self, count: int, dt: float) -> Array:
         return each(self.radius, count) + each(self.tube, count)

@@ -69,7 +69,7 @@ class Unicycle:
     def heading(self, state: UnicycleState) -> Array:
         return state.angle
 
-    def stop(self, state: UnicycleState) -> Array:
+    def stop(self, state: UnicycleState, dt: float) -> Array:
         return self.place(state)
 
     def size(self, count: int, dt: float) -> Array:
