@@ -85,7 +85,7 @@ class Consat:
     def __init__(self, model, obstacles=()):
         self.model, self.obstacles = model, obstacles
 
-    @functools.cache
+    @functools.cache  # noqa: B019 - lives as long as the benchmark
     def _compiled(self, count, dimension, planned):
         drive = Drive(self.model, count, dimension, DT, self.obstacles)
         planner = Planner(drive.map, float(drive.size.max())) if planned else None

@@ -14,9 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from consat.engine.round import Driven
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import Shared
+from consat.robots import Fleet
+from consat.robots.model import Model
 
 
 @dataclass(frozen=True)
@@ -94,3 +97,26 @@ def _merged(old: Any, new: Any, places: tuple[np.ndarray, np.ndarray]) -> Any:
     fits: Any = tuple(slice(min(a, b)) for a, b in zip(kept.shape[1:], merged.shape[1:], strict=True))
     merged[(there, *fits)] = kept[(slice(None), *fits)]
     return jnp.asarray(merged)
+
+
+def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence[str], after: Sequence[str]) -> Driven:
+    """Robots of a team of other members: those who stay go on as they were, and what came of it so far stays."""
+    report = new.memory.report._replace(
+        **{name: getattr(old.memory.report, name) for name in old.memory.report._fields if name != "halted"}
+    )
+    state = new.state
+    if not isinstance(model, Fleet) and str(jax.tree.structure(old.state)) == str(jax.tree.structure(new.state)):
+        places = _places(before, after)
+        state = jax.tree.map(lambda a, b: _merged(a, b, places), old.state, new.state)
+    return new._replace(state=state, memory=new.memory._replace(report=report))
+
+
+def robot_placed(model: Model[Any], state: Any, i: int, place: np.ndarray) -> Any:
+    """The state of robots of which one, i, is now at rest at its place among (N, d)."""
+    if isinstance(model, Fleet):
+        kind = int(model.kinds[i])
+        rows = model.members[kind]
+        own = robot_placed(model.models[kind], state[kind], int(np.searchsorted(rows, i)), place[rows])
+        return (*state[:kind], own, *state[kind + 1 :])
+    fresh = model.start(jnp.asarray(place))
+    return jax.tree.map(lambda a, b: jnp.asarray(a).at[i].set(jnp.asarray(b)[i]), state, fresh)

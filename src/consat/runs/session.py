@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike
 from consat.certify.certificate import Verdict, bounds
 from consat.certify.optimum import max_min
 from consat.certify.reasons import explain
-from consat.engine.carry import Names, carried
+from consat.engine.carry import Names, carried, robot_placed, robots_carried
 from consat.engine.chunks import CHUNK, Chunk, OneProcess
 from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Body, Now, World, world_of
-from consat.engine.rounds import Tally, known_of
+from consat.engine.rounds import Tally, driven, known_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam, closest, shown
 from consat.numerics import float64
 from consat.problem.constraints.library import ADJUSTABLE, adjustable
@@ -39,6 +39,7 @@ from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior.layout import form_of
 from consat.results.result import Result
 from consat.results.trace import Trace
+from consat.robots.description import asked
 from consat.runs.options import RATE, Options
 from consat.runs.preparation import Prepared, copies_of, scenario_of, settings_of
 from consat.runs.summary import summarise
@@ -92,8 +93,12 @@ class Session:
         smoothing: as in `consat.run`.
         loss: probability that a message is lost.
         sleep: probability that an agent skips a round.
-        rate: rounds a second, Hz; what schedules and `time` go by.
+        rate: rounds a second, Hz; what schedules, robots and `time` go by. By default that of the scenario, or 20.
         speed: the most that a body moves, length/s; None if bodies are where their agents want to be.
+        robots: what bodies are, as in `consat.run`; a robot that joins later is like the first, if nobody says.
+        obstacles: what robots keep clear of, as in `consat.run`.
+        wind: as in `consat.run`.
+        noise: as in `consat.run`.
 
     Raises:
         InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
@@ -105,25 +110,27 @@ class Session:
     def __init__(
         self, team: Team | Scenario | str, *, protocol: str | None = None, estimates: Layout | None = None, seed: int | None = None,
         start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
-        rate: float = RATE, speed: float | None = None,
+        rate: float | None = None, speed: float | None = None, robots: Any = None, obstacles: Sequence[Any] | None = None,
+        wind: Sequence[float] = (), noise: float = 0.0,
     ) -> None:  # fmt: skip
         scenario = scenario_of(team)
         self._options = Options(
-            protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, rate=rate,
-            speed=speed, stop="never",
+            protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep,
+            rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
+            robots=asked(robots, obstacles, scenario.robots, scenario.team.ids),
         )  # fmt: skip
         self._name, self._source = scenario.name, scenario
         settings = settings_of(scenario.settings, self._options, scenario.team)
-        kind = str(settings.protocol.kind)
+        kind = self._kind = str(settings.protocol.kind)
         if kind in FLOWS:
             raise InvalidSettings(
                 f"protocol {kind} flows in continuous time, but a session goes in rounds; choose one of {', '.join(ROUNDS)}"
             )
         self._protocol = with_gains(ROUNDS[kind](), settings.protocol)
-        self._body = self._options.pace(kind, scenario.team).body or Body(rate)
+        self._body = self._body_of(scenario.team)
         self._weather = self._options.weather(settings.start.seed)
         ready = Prepared.of(scenario.team, settings)
-        self._engine = self._built(ready, ready.first())
+        self._engine = self._built(ready, ready.first(drive=self._body.drive), self._body)
         state, chunk = self._engine.carrier.start()
         self._state: Now = state
         self._tally, self._record = Tally(), Memory()
@@ -157,7 +164,8 @@ class Session:
         self._margins, self._positions = margins[-1], position[-1]
         chosen = numbers % self._record.every == 0
         if chosen.any():
-            rows = Rows(numbers, position, None, margin, smooth, margins, None, None, bound)
+            heading = None if self._body.drive is None else chunk.kept.heading[:count]
+            rows = Rows(numbers, position, None, margin, smooth, margins, None, None, bound, heading)
             self._record.append(rows.where(np.flatnonzero(chosen)))
 
     @property
@@ -179,6 +187,12 @@ class Session:
     def margins(self) -> np.ndarray:
         """(N,) the margin of every agent, in the order of ``session.team.ids``."""
         return np.array(self._margins)
+
+    @property
+    def headings(self) -> np.ndarray | None:
+        """(N,) which way robots look, rad; None where bodies are points."""
+        drive, robots = self._body.drive, self._state.robots
+        return None if drive is None or robots is None else np.array(drive.model.heading(robots.state))
 
     @property
     def margin(self) -> float:
@@ -393,7 +407,10 @@ class Session:
         rows = self._record.close()
         if not len(rows.step) or rows.step[-1] != tally.done:
             margin, smooth, bound = (np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound))
-            last = Rows(np.array([tally.done]), self._positions[None], None, margin, smooth, self._margins[None], None, None, bound)
+            heading = None if (now := self.headings) is None else now[None]
+            last = Rows(
+                np.array([tally.done]), self._positions[None], None, margin, smooth, self._margins[None], None, None, bound, heading
+            )
             rows = rows.joined(last) if len(rows.step) else last
         period, team = 1.0 / self._body.rate, self.team
         trace = Trace(
@@ -402,11 +419,13 @@ class Session:
             holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
             satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
             floats_sent=tally.floats, known=known_of(tally), known_from=None, seconds={"compile": 0.0, "run": 0.0}, period=period,
-            bound=rows.bound, motion=tally.motion(period),
+            bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
         )  # fmt: skip
         scenario = dataclasses.replace(scenario_of(team), name=self._name)
-        return Result(summarise(scenario, ready.settings, ready.schedule, ready.size, trace, full=False), trace=trace, team=team,
-                      scenario=scenario.text)  # fmt: skip
+        summary = summarise(scenario, ready.settings, ready.schedule, ready.size, trace, full=False)
+        robots = self._options.robots
+        summary |= {"robots": None, "obstacles": None} if robots is None else {key: robots.data[key] for key in ("robots", "obstacles")}
+        return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
     def __repr__(self) -> str:
         team = self._engine.ready.team
@@ -414,13 +433,19 @@ class Session:
 
     # ---- inside -------------------------------------------------------------------------------------------------------------------------
 
-    def _built(self, ready: Prepared, first: np.ndarray) -> _Engine:
+    def _body_of(self, team: Team) -> Body:
+        """What bodies are, for a team."""
+        body = self._options.pace(self._kind, team).body
+        assert body is not None, "a session has a rate"
+        return body
+
+    def _built(self, ready: Prepared, first: np.ndarray, body: Body) -> _Engine:
         team, kind = ready.team, str(ready.settings.protocol.kind)
         require_connected(team)
-        live = Live.of(team, 1.0 / self._body.rate, all_of_them=True)
+        live = Live.of(team, 1.0 / body.rate, all_of_them=True)
         assert live is not None
         world = world_of(
-            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=self._weather, body=self._body,
+            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=self._weather, body=body,
             speaks=self._protocol.speaks, live=live,
         )  # fmt: skip
         choice = Choice.of(team, ready.copies, "all", estimates=False)
@@ -438,16 +463,20 @@ class Session:
         ready = old.ready._replace(team=team, copies=copies)
         kind = str(ready.settings.protocol.kind)
         names = [Names.of(each.team, each.copies, pairs=kind in PAIRED) for each in (old.ready, ready)]
-        first, body = self._first(ready)
-        engine = self._built(ready, first)
+        first, place = self._first(ready)
+        body = self._body_of(team)
+        engine = self._built(ready, first, body)
         state, _ = engine.carrier.start()
         inner = carried(self._protocol.per, self._state.state, state.state, *names)
-        state = state._replace(state=_begun_anew(inner), body=jnp.asarray(body), key=self._state.key)
+        robots = state.robots
+        if robots is not None and self._state.robots is not None and body.drive is not None:
+            robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
+        state = state._replace(state=_begun_anew(inner), body=jnp.asarray(place), key=self._state.key, robots=robots)
         margins = np.asarray(_margins(engine.carrier.world, state, float(self.round)))
         # from here on nothing can fail
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
-        self._engine, self._state, self._positions, self._margins = engine, state, body, margins
+        self._engine, self._state, self._positions, self._margins, self._body = engine, state, place, margins, body
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
         """(C, d) estimates to begin with: of new copies where their owner is, and (N, d) bodies."""
@@ -628,7 +657,10 @@ def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> 
     heard = now.heard
     if heard is not None:
         heard = heard._replace(position=heard.position.at[row].set(jnp.asarray(value)))
-    return now._replace(state=state, body=body, heard=heard)
+    robots = now.robots
+    if robots is not None and world.drive is not None:
+        robots = robots._replace(state=robot_placed(world.drive.model, robots.state, i, np.asarray(body)))
+    return now._replace(state=state, body=body, heard=heard, robots=robots)
 
 
 @jax.jit
@@ -649,5 +681,6 @@ def _renamed(record: Memory, before: Sequence[str], after: Sequence[str]) -> Mem
         return found
 
     fresh = Memory(record.every)
-    fresh.append(rows._replace(position=arranged(rows.position), agent_margin=arranged(rows.agent_margin)))
+    heading = None if rows.heading is None else arranged(rows.heading)
+    fresh.append(rows._replace(position=arranged(rows.position), agent_margin=arranged(rows.agent_margin), heading=heading))
     return fresh
