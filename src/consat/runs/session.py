@@ -408,9 +408,8 @@ class Session:
         if not len(rows.step) or rows.step[-1] != tally.done:
             margin, smooth, bound = (np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound))
             heading = None if (now := self.headings) is None else now[None]
-            last = Rows(
-                np.array([tally.done]), self._positions[None], None, margin, smooth, self._margins[None], None, None, bound, heading
-            )
+            done, own = np.array([tally.done]), self._margins[None]
+            last = Rows(done, self._positions[None], None, margin, smooth, own, None, None, bound, heading)
             rows = rows.joined(last) if len(rows.step) else last
         period, team = 1.0 / self._body.rate, self.team
         trace = Trace(
