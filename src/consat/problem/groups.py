@@ -36,6 +36,8 @@ SELF = "self"
 """In a group's expression: the member itself."""
 PLACE = "place"
 """As a centre: the member's own place; as a displacement: as its place lies to the other's."""
+ACROSS = "across"
+"""As a centre: the place across the middle of the group from the member's own."""
 MOST = 2**27
 """Members at most; copies and links are counted by int32."""
 
@@ -54,7 +56,7 @@ def each(constraint: Any, *, of: Any = None, agent: Any = None) -> Each:
 
     Args:
         constraint: what `consat.within` and its like return. A parameter may be an array with one value for each member that has the
-            constraint, and a centre or displacement may be ``"place"``.
+            constraint, a centre or displacement may be ``"place"``, and a centre ``"across"``.
         of: who has it: ``"first"``, ``"last"``, an id, a list of ids, ``{"every": k}`` (every k-th, on a grid along every axis), or an
             array of places in the group; all, if None.
         agent: for an expression, whom ``other`` means in it; see `consat.problem.groups`. ``self`` is the member.
@@ -380,6 +382,8 @@ class Expansion:
     def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
         """(M, …) of one parameter, or the schedule that all share; of no use if it has faults."""
         value, places = parameter.value, self.layout.places
+        if isinstance(parameter, Vector) and isinstance(value, str) and value == ACROSS and key == "center":
+            return -places[row]
         if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
             return places[row] - places[other - self.first] if key == "vector" else places[row]
         if isinstance(value, np.ndarray) and value.ndim == (2 if isinstance(parameter, Vector) else 1) and not _fixed(parameter):
