@@ -159,7 +159,11 @@ def _made(data: Any, kinds: Mapping[str, Any], where: str, example: str, base: M
     if missing := [name for name in needed if name not in data]:
         raise InvalidInput([Fault((missing[0],), f"{missing[0]} is missing; {kind} needs {', '.join(needed)}", where)])
     inherited = {} if base is None or base.get("kind") != kind else {key: value for key, value in base.items() if key != "kind"}
-    return kinds[kind](**{**inherited, **{key: value for key, value in data.items() if key != "kind"}})
+    try:
+        return kinds[kind](**{**inherited, **{key: value for key, value in data.items() if key != "kind"}})
+    except InvalidInput as error:
+        named = [f"{where}, {fault.path[0]}" if fault.path else where for fault in error.faults]
+        raise InvalidInput(dataclasses.replace(fault, where=each) for fault, each in zip(error.faults, named, strict=True)) from None
 
 
 def _stacked(kind: Any, models: Sequence[Any]) -> Any:

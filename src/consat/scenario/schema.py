@@ -147,6 +147,8 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
         return None
     base = common if isinstance(common, dict) else {"kind": "point"}
     whole = _made(functools.partial(model_of, base), ("robots",), "robots", faults)
+    if whole is None:  # a fault of all is none of each
+        return None
     each_own = {
         str(entry.get("id")): model
         for i, entry in own
@@ -154,7 +156,7 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
             functools.partial(model_of, entry["robot"], f"agent {entry.get('id')!r}, robot", base), ("agents", i, "robot"), "", faults
         )) is not None
     }  # fmt: skip
-    if whole is None or len(faults.found) > known:
+    if len(faults.found) > known:
         return None
     for model, path in ((whole, ("robots", "kind")), *((each, ("robots",)) for each in each_own.values())):
         if isinstance(dimension, int) and dimension not in model.dimensions:
