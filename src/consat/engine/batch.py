@@ -55,12 +55,12 @@ class Then(NamedTuple):
     Attributes:
         before: the layout until then.
         after: the layout from then on.
-        case: what is run from then on.
+        case: gives what is run from then on, always the same; made when it is first asked for.
     """
 
     before: Estimates
     after: Estimates
-    case: Case
+    case: Callable[[], Case]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def _go_on(protocol: Rounds, lanes: Sequence[Lane], outcomes: dict[int, Outcome]
         if then is not None and found.ending == "out of time" and found.tally.done < lane.case.rules.end:
             first = then.after.carried(then.before, found.estimates, found.positions)
             tally = dataclasses.replace(found.tally, turned=found.tally.done, near=0)
-            groups[like(then.case)].append((k, Lane(then.case, first, later(lane.seed), tally)))
+            groups[like(then.case())].append((k, Lane(then.case(), first, later(lane.seed), tally)))
     for some in groups.values():
         ended = simulate_batch(protocol, [lane for _, lane in some])
         outcomes |= {k: outcome for (k, _), outcome in zip(some, ended, strict=True)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -43,8 +44,9 @@ def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
     )  # fmt: skip
     if ready.then is None:
         return Case(along, gains, rules)
-    after = Case(world(ready.then), gains, rules)
-    return Case(along, gains, dataclasses.replace(rules, turn=turn_after(along)), Then(ready.copies, ready.then, after))
+    then = ready.then
+    after = functools.cache(lambda: Case(world(then), gains, rules))
+    return Case(along, gains, dataclasses.replace(rules, turn=turn_after(along)), Then(ready.copies, then, after))
 
 
 @float64
