@@ -238,3 +238,20 @@ def test_a_film_of_seven_agents_is_small_and_shows_its_whole_legend(tmp_path: Pa
     assert last[-3:].min() > 240  # nothing reaches the lower edge
     assert last[:, -3:].min() > 240  # nor the right one
     assert path.stat().st_size < 150_000
+
+
+def test_goals_that_move_are_told_along_their_way(tmp_path: Path) -> None:
+    from tests.unit.test_views import escort
+
+    result = escort()
+    balls = replay.document(result)["balls"]
+    [goal] = [ball for ball in balls if not ball["out"]]
+    [bar] = [ball for ball in balls if ball["out"]]
+    assert bar["track"] is None
+    at, centers = goal["track"]["at"], np.array(goal["track"]["center"])
+    assert (at[0], at[-1]) == (0, 20)
+    assert centers[:, 0] == pytest.approx(-4 + 0.4 * np.array(at))
+    found = messages(result.export(tmp_path / "run.mcap"))["/scene"]
+    later = [dict(fields(entity))[3] for field, entity in fields(found[5][1]) if field == 2]
+    assert b"region 0" in later
+    assert b"keep-out 1" not in later

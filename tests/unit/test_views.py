@@ -663,3 +663,41 @@ def test_views_load_no_matplotlib_before_a_figure_is_asked_for() -> None:
     code = "import sys, consat.views, consat.views.words; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+# ---- constraints that move
+
+
+def escort(count: int = 2, dimension: int = 2) -> Result:
+    """A goal that goes from -4 to 4 in 10 s, beside a keep-out that stays, in a run of 20 rounds that takes 10 s."""
+    way = cs.schedule([0, 10], [[-4.0, *[0.0] * (dimension - 1)], [4.0, *[0.0] * (dimension - 1)]])
+    agents = [cs.Agent(f"m{i}", [cs.within(way, 1), cs.outside([0.0] * dimension, 0.5)]) for i in range(count)]
+    team = cs.Team(agents, links="line", dimension=dimension)
+    end = np.zeros((count, dimension))
+    end[:, 0] = 4.0
+    verdicts = [{"from": 0.0, "to": 10.0, "verdict": "feasible", "bounds": [1.0, 1.0]}]
+    flat = made(team.at(10.0), end, clock="round", samples=21, copies=False, verdicts=verdicts)
+    return Result(flat.summary, flat.data, team=team)
+
+
+@pytest.mark.parametrize("count", [2, 20])
+def test_a_goal_that_moves_is_drawn_where_it_is(count: int) -> None:
+    shown = scene.Scene(escort(count))
+    for moment, middle in ((0.0, -4.0), (10.0, 0.0), (20.0, 4.0)):
+        shown.show(moment)
+        [region] = shadings(shown.figure)
+        low, high = region.get_path().vertices.min(axis=0), region.get_path().vertices.max(axis=0)
+        assert (low + high) / 2 == pytest.approx([middle, 0], abs=0.1)
+        [bar] = patches(shown.figure, "keep-out")
+        assert bar.get_path().contains_point((0, 0.3))
+
+
+def test_a_goal_that_moves_is_drawn_where_it_is_in_space() -> None:
+    shown = scene.Scene(escort(2, 3))
+    for moment, middle in ((0.0, -4.0), (10.0, 0.0), (20.0, 4.0)):
+        shown.show(moment)
+        drawn(shown.figure)
+        rings = [np.concatenate(lines._segments3d) for lines in named(shown.figure, "boundary")]
+        assert len(rings) == 2
+        centers = [(ring.min(axis=0) + ring.max(axis=0))[0] / 2 for ring in rings]
+        assert centers == pytest.approx([0.0, middle])

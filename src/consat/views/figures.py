@@ -231,6 +231,13 @@ def _stretch(axes: Axes, *curves: np.ndarray) -> None:
     axes.set_ylim(limits)
 
 
+def seconds(result: Result, steps: np.ndarray) -> np.ndarray:
+    """The times, s, of recorded steps; of rounds that take no time, or of which nobody says, their numbers."""
+    verdicts = result.summary.get("verdicts")
+    last = float(result.data["margin"].coords[result.data["margin"].dims[0]].values[-1])
+    return steps * (float(verdicts[-1]["to"]) / last if verdicts and last > 0 else 1.0)
+
+
 def label(what: str, unit: str | None) -> str:
     """The label of an axis: what it shows, with the unit if one is given."""
     return what if unit is None else f"{what} [{plain(unit)}]"

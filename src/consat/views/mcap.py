@@ -17,7 +17,7 @@ import numpy as np
 from consat.errors import InvalidSettings
 from consat.results.result import Result
 from consat.views import space
-from consat.views.figures import colour, recorded, view
+from consat.views.figures import colour, recorded, seconds, view
 from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
@@ -71,7 +71,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> Path:
         pictures = channels.SceneUpdateChannel("/scene", context=context)
         number = foxglove.Channel("/margin", schema=_schema(["margin", "smooth_margin", "step"]), message_encoding="json", context=context)
         each = foxglove.Channel("/agent_margins", schema=_schema(ids), message_encoding="json", context=context)
-        scene = _Scene(team, ids, x, int(result.data["position"].shape[2]))
+        scene = _Scene(team, ids, x, seconds(result, steps), int(result.data["position"].shape[2]))
         for k, time in enumerate(times):
             stamp = messages.Timestamp(sec=int(time), nsec=round((time - int(time)) * 1e9) % 1_000_000_000)
             nanoseconds = round(time * 1e9)
@@ -131,7 +131,8 @@ def _vector(place: np.ndarray) -> Any:
 class _Scene:
     """Regions, links and names; what stands still is told once, at the first step."""
 
-    def __init__(self, team: Team | None, ids: list[str], x: np.ndarray, dimension: int) -> None:
+    def __init__(self, team: Team | None, ids: list[str], x: np.ndarray, times: np.ndarray, dimension: int) -> None:
+        self._times = times
         self._team, self._ids, self._x, self._flat = team, ids, x, dimension < 3
         self._shapes: Shapes | None = None
         self._traced: list[int] = []
@@ -148,7 +149,8 @@ class _Scene:
         """What is new at a step."""
         x = self._x[k]
         if self._shapes is not None and self._team is not None:
-            yield from self._balls(self._shapes.balls, k, x, stamp)
+            time = float(self._times[k])
+            yield from self._balls(shapes(self._team, time).balls if self._team.moves else self._shapes.balls, k, x, stamp)
             yield from self._outlines(k, x, stamp)
             if k == 0:
                 yield from self._walls(self._shapes.walls, stamp)
@@ -169,7 +171,7 @@ class _Scene:
         chosen = np.flatnonzero(balls.around < 0) if len(balls.radius) > MOST_NAMED else np.arange(len(balls.radius))
         centers = _in_space(balls.at(x[:, : balls.center.shape[1]]))
         for j in chosen[:MOST_SHAPES].tolist():
-            if k and balls.around[j] < 0:
+            if k and not balls.moves[j]:
                 continue
             out, radius = bool(balls.keeps_out[j]), float(balls.radius[j])
             shade = _colour(KEEP_OUT if out else _rgb(balls.owners[j]), 0.7 if out else 0.12)
@@ -197,7 +199,10 @@ class _Scene:
         if self._team is None:
             return
         asked = [number for number in self._traced if k == 0 or self._moves[number]]
-        for number, found in zip(asked, outlines(self._team, asked, x[:, :2], self._low, self._high) if asked else (), strict=True):
+        if not asked:
+            return
+        now = self._team.at(float(self._times[k]))
+        for number, found in zip(asked, outlines(now, asked, x[:, :2], self._low, self._high), strict=True):
             shade = _rgb((int(self._team.owner[number]),))
             yield self._entity(f"region {number}", stamp, lines=[self._line(_in_space(line), shade, 2.0) for line in found])
 

@@ -111,14 +111,25 @@
       return dots.get(colour);
     }
 
+    // A ball that moves by a schedule is told at some samples, and moves evenly between them.
+    function ballNow(frame, ball) {
+      if (!ball.track) return ball;
+      const { at, center: centers, radius } = ball.track;
+      let a = 0;
+      while (a < at.length - 1 && at[a + 1] <= frame.moment) a += 1;
+      const b = Math.min(a + 1, at.length - 1), share = b > a ? Math.min(1, (frame.moment - at[a]) / (at[b] - at[a])) : 0;
+      const mix = (u, v) => (1 - share) * u + share * v;
+      return { ...ball, center: centers[a].map((value, k) => mix(value, centers[b][k])), radius: mix(radius[a], radius[b]) };
+    }
+
     function ballCenter(frame, ball) {
       const at = [0, 0, 0];
       for (let k = 0; k < d; k += 1) at[k] = ball.center[k] + (ball.around < 0 ? 0 : frame.where[ball.around * d + k]);
       return at;
     }
 
-    function drawBall(frame, ball, loud) {
-      const at = ballCenter(frame, ball), [px, py] = project(...at), r = scale * ball.radius, colour = ownerColour(ball.owners, ball.out);
+    function drawBall(frame, told, loud) {
+      const ball = ballNow(frame, told), at = ballCenter(frame, ball), [px, py] = project(...at), r = scale * ball.radius, colour = ownerColour(ball.owners, ball.out);
       if (!scene.few && ball.around >= 0 && !loud) return;
       pen.beginPath(); pen.arc(px, py, r, 0, 2 * Math.PI);
       pen.fillStyle = colour;
@@ -147,7 +158,7 @@
 
     // The goals of a crowd: overlaps are tinted once, and of very many no edges are drawn.
     function drawUnion(frame) {
-      const goals = scene.balls.filter((ball) => !ball.out && ball.around < 0);
+      const goals = scene.balls.filter((ball) => !ball.out && ball.around < 0).map((ball) => ballNow(frame, ball));
       pen.beginPath();
       for (const ball of goals) {
         const [px, py] = project(...ballCenter(frame, ball)), r = scale * ball.radius;

@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -26,9 +26,9 @@ from consat.problem.team import Team
 from consat.results.result import Result
 from consat.views import space, words
 from consat.views.colours import classes
-from consat.views.figures import number, recorded, view
+from consat.views.figures import number, recorded, seconds, view
 from consat.views.outlines import MOST, outlines
-from consat.views.shapes import boxes, moves, shapes
+from consat.views.shapes import Balls, Walls, boxes, moves, shapes, ways
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
@@ -157,7 +157,8 @@ def document(result: Result) -> dict[str, Any]:
     chosen = _steps(x[: last + 1])
     x = x[chosen]
     dimension = x.shape[2]
-    low, high, found = _regions(team, x)
+    times = seconds(result, data[clock].values[chosen].astype(float))
+    low, high, found = _regions(team, x, times)
     margin, agent_margin, steps = (data[name].values[chosen] for name in ("margin", "agent_margin", clock))
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
@@ -202,19 +203,21 @@ def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray
     return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
 
 
-def _regions(team: Team | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
+def _regions(team: Team | None, x: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
     """The box to show, low and high, and the regions."""
     dimension = x.shape[2]
     if team is None or len(team.owner) > MOST_SHAPES:
         low, high, _ = view(x, x[-1], None)
         return low, high, {"balls": [], "walls": [], "outlines": []}
-    geometry = shapes(team)
-    balls, around = geometry.balls, [boxes(team)[:, :, :dimension]]
+    geometry = shapes(team, times[-1])
+    balls, around = geometry.balls, [boxes(team)[:, :, :dimension], ways(team, times)[:, :, :dimension]]
     if team.dimension <= 3:
         center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
         fixed = np.concatenate([center - radius, center + radius], axis=1)
         around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
     low, high, _ = view(x, x[-1], None, np.concatenate(around))
+    moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
+    seen = [shapes(team, times[moment]) for moment in moments]
     told: list[Mapping[str, Any]] = [
         {
             "center": balls.center[k].tolist(),
@@ -222,31 +225,49 @@ def _regions(team: Team | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
             "radius": float(balls.radius[k]),
             "out": bool(balls.keeps_out[k]),
             "owners": list(balls.owners[k]),
+            "track": _track(moments, [each.balls for each in seen], k) if seen and balls.moves[k] else None,
         }
         for k in range(len(balls.radius))
         if team.dimension <= 3
     ]
-    return low, high, {"balls": told, "walls": _walls(team, low, high), "outlines": _outlines(team, geometry.others, x, low, high)}
+    lines = _outlines(team, geometry.others, x, times, low, high)
+    return low, high, {"balls": told, "walls": _walls(team, geometry.walls, low, high), "outlines": lines}
 
 
-def _walls(team: Team, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
+def _moments(x: np.ndarray) -> np.ndarray:
+    """Samples at which moving regions are told."""
+    return np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int))
+
+
+def _track(moments: np.ndarray, seen: Sequence[Balls], k: int) -> Mapping[str, Any]:
+    """Where a ball is at some samples; between them it moves evenly."""
+    return {
+        "at": moments.tolist(),
+        "center": [np.round(balls.center[k], 6).tolist() for balls in seen],
+        "radius": [round(float(balls.radius[k]), 6) for balls in seen],
+    }
+
+
+def _walls(team: Team, walls: Walls, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
     """Half-spaces as polygons within the view, of a team in the plane as lines; those of a box are cut by each other."""
     if team.dimension not in (2, 3):
         return []
-    walls, beyond = shapes(team).walls, 10 * (high - low) * (team.dimension == 2)  # a reader may pan
+    beyond = 10 * (high - low) * (team.dimension == 2)  # a reader may pan
     return [
         {"corners": np.round(corners, 6).tolist(), "normal": walls.normal[k].tolist(), "owners": list(walls.owners[k])}
         for k, corners in space.faces(walls, low - beyond, high + beyond)
     ]
 
 
-def _outlines(team: Team, numbers: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
+def _outlines(
+    team: Team, numbers: np.ndarray, x: np.ndarray, times: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> list[Mapping[str, Any]]:
     """The boundaries of other ψ in the plane, at some moments where they move."""
     if team.dimension != 2 or not 0 < len(numbers) <= MOST:
         return []
     moving = moves(team)[numbers]
-    moments = np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int)) if moving.any() else np.array([len(x) - 1])
-    traced = [outlines(team, numbers.tolist(), x[moment], low, high) for moment in moments]
+    moments = _moments(x) if moving.any() else np.array([len(x) - 1])
+    traced = [outlines(team.at(times[moment]), numbers.tolist(), x[moment], low, high) for moment in moments]
     digits = max(0, 4 - int(np.floor(np.log10(float((high - low).max()) or 1.0))))
     found: list[Mapping[str, Any]] = []
     for k, constraint in enumerate(numbers.tolist()):

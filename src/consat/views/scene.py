@@ -17,12 +17,13 @@ from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
+from consat.problem.team import Team
 from consat.results.result import Result
 from consat.views import areas, space
 from consat.views.areas import SHARED, Area, Ground
 from consat.views.colours import AREA, LINK, TRAIL, classes
-from consat.views.figures import GREY, colour, grid, label, marker, number, plain, recorded, regions, view
-from consat.views.shapes import Shapes, boxes, moves, shapes
+from consat.views.figures import GREY, colour, grid, label, marker, number, plain, recorded, regions, seconds, view
+from consat.views.shapes import Shapes, boxes, moves, shapes, ways
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
@@ -73,6 +74,7 @@ class Scene:
         self.steps, self._margin, self._agent_margin = (data[name].values for name in (self._clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
         self.last = int(finite[-1]) if len(finite) else 0
+        self._times = seconds(result, self.steps.astype(float))
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
@@ -86,15 +88,16 @@ class Scene:
         self._areas: list[Area] = []
         self._ground: Ground | None = None
         self._shapes: Shapes | None = None
+        self._lawn: list[Artist] = []
         if self._team is not None and (self._space or not self._few):
-            self._shapes = shapes(self._team)
+            self._shapes = shapes(self._team, self._times[self.last])
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
         rows, letters = self._legend() if self._few else self._crowd_legend(own)
         if own:
             height = max(5.2, 0.6 + 0.235 * rows)  # at low resolutions letters are taller
             self.figure.set_size_inches(1.5 + (height - 0.8) * ratio + 0.08 * letters, height + 0.6 * (not self._few))
         if self._space:
-            list(self._bodies(self.x[self.last], moving=False))
+            list(self._bodies(self.x[self.last], self.last, moving=False))
         else:
             self._cast()
 
@@ -110,7 +113,8 @@ class Scene:
         """Limits, labels and regions; returns how wide the axes should be for their height."""
         axes, team, x = self.axes, self._team, self.x[self.last]
         axis_count = 3 if self._space else 2
-        low, high, self._cut = view(self.x[: self.last + 1, :, :axis_count], x, team if self._few else None, self._boxes(x, axis_count))
+        seen = self._then(self.last) if self._few else None
+        low, high, self._cut = view(self.x[: self.last + 1, :, :axis_count], x, seen, self._boxes(x, axis_count))
         self._along, self._points = grid(low, high, 2 if self._space else self._fine)
         labels = [label(f"position {name}", unit) for name in names]
         if self._line:
@@ -137,7 +141,7 @@ class Scene:
         """(B, 2, p) around the regions that the view has to hold besides what `view` finds."""
         if self._team is None:
             return None
-        found = [boxes(self._team)[:, :, :axes]]
+        found = [boxes(self._team)[:, :, :axes], ways(self._team, self._times[: self.last + 1])[:, :, :axes]]
         if not self._few and self._shapes is not None and not self._line:
             balls = self._shapes.balls
             fixed = balls.around < 0
@@ -148,24 +152,35 @@ class Scene:
     def _settle(self, team: Any, x: np.ndarray) -> None:
         """The regions: those of a few agents follow at every `show`, those of a crowd that stay where they are stand here."""
         if self._line and self._few:
-            values = np.stack([regions(team, at, self._points) for at in _between(self.x, self._columns)], axis=2)
+            times = _between(self._times, self._columns)
+            columns = zip(times, _between(self.x, self._columns), strict=True)
+            values = np.stack([regions(team.at(time), at, self._points) for time, at in columns], axis=2)
             self._areas, self._tube = areas.areas(team, values), values
         elif self._few and not self._space:
             shape = (-1, self._fine, self._fine)
-            values = regions(team, x, self._points).reshape(shape).swapaxes(1, 2)
-            self._moves = [family for family in team.families if family.arity > 1]
-            self._still = np.array([number for family in team.families if family.arity == 1 for number in family.number], dtype=int)
+            values = regions(team.at(self._times[self.last]), x, self._points).reshape(shape).swapaxes(1, 2)
+            self._moves = [family for family in team.families if family.arity > 1 or family.tracks]
+            changing = {int(number) for family in self._moves for number in family.number}
+            self._still = np.array([number for number in range(len(team.owner)) if number not in changing], dtype=int)
             self._areas, self._values = areas.areas(team, values), values
         elif self._few:
             self._areas = areas.areas(team)
         elif self._shapes is not None and not self._space and not self._line:
-            self._plain(self._shapes, x)
+            self._lawn = self._plain(self._shapes, x, self.last)
         if self._few and not self._space:
             self._ground = Ground(self.axes, team, self._areas, self._unit)
 
-    def _plain(self, found: Shapes, x: np.ndarray) -> None:
-        """The regions of a crowd in the plane, of constraints that don't move with agents."""
-        axes, team = self.axes, cast(Any, self._team)
+    def _time(self, moment: float) -> float:
+        """The time, s, of a moment."""
+        return float(_between(self._times, moment)[0])
+
+    def _then(self, moment: float) -> Team | None:
+        """The team with its constraints as they are at a moment."""
+        return None if self._team is None else self._team.at(self._time(moment))
+
+    def _plain(self, found: Shapes, x: np.ndarray, moment: float) -> list[Artist]:
+        """The regions of a crowd in the plane, of constraints that don't move with agents; returns what was drawn."""
+        axes, team, before = self.axes, cast(Team, self._then(moment)), set(self.axes.get_children())
         center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
         goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
         self._kinds = {"goal": len(goals), "bar": len(bars)}
@@ -194,6 +209,7 @@ class Scene:
             for number in sorted(int(number) for family in others for number in family.number):
                 for line in areas.contours(across, up, values[number]):
                     axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))
+        return [artist for artist in axes.get_children() if artist not in before]
 
     def _crowd_legend(self, own: bool) -> tuple[int, int]:
         """A colour bar for the agents' margins, and below what the lines are; returns the legend's rows and the bar's letters."""
@@ -299,7 +315,7 @@ class Scene:
         if self._space:
             for artist in self.moving:
                 artist.remove()
-            bodies = self._bodies(_between(self.x, moment)[0], moving=True)
+            bodies = self._bodies(_between(self.x, moment)[0], moment, moving=True)
             self.moving = [*bodies, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
             self.moving += self._agents(trail) if self._few else self._crowd(trail, sample)
             style: dict[str, Any] = {"color": LINK, "linewidth": 1 if self._few else 0.6, "linestyle": DOTS, "gid": "link"}
@@ -313,27 +329,42 @@ class Scene:
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 
     def _move(self, trail: np.ndarray, moment: float) -> None:
+        """Move the artists in the plane."""
         if not self._line:
             self._wires.set_data(*_joined(trail[-1][self._links]))
-        if self._ground is not None and self._line:
-            seen = np.count_nonzero(self._columns <= moment)
-            self._ground.show(_between(self.steps, self._columns[:seen]), self._along[0], self._tube[:, :, :seen])
-        elif self._ground is not None:
-            if self._moves:
-                shape = self._values.shape
-                values = regions(cast(Any, self._team), _between(self.x, moment)[0], self._points, self._moves)
-                values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
-                values[self._still] = self._values[self._still]
-                self._values = values
-            across, up = self._along
-            self._ground.show(across, up, self._values)
-        if self._few:
-            for i, (path, head, name) in enumerate(zip(self._paths, self._heads, self._names, strict=True)):
-                path.set_data(*trail[:, i].T)
-                head.set_data(*trail[-1, i, :, None])
-                name.xy = trail[-1, i]
+        if self._ground is not None:
+            self._move_ground(self._ground, moment)
+        if not self._few:
+            self._move_crowd(trail, moment)
             return
+        for i, (path, head, name) in enumerate(zip(self._paths, self._heads, self._names, strict=True)):
+            path.set_data(*trail[:, i].T)
+            head.set_data(*trail[-1, i, :, None])
+            name.xy = trail[-1, i]
+
+    def _move_ground(self, ground: Ground, moment: float) -> None:
+        if self._line:
+            seen = np.count_nonzero(self._columns <= moment)
+            ground.show(_between(self.steps, self._columns[:seen]), self._along[0], self._tube[:, :, :seen])
+            return
+        if self._moves:
+            shape = self._values.shape
+            families = [family.at(self._time(moment)) for family in self._moves]
+            values = regions(cast(Team, self._team), _between(self.x, moment)[0], self._points, families)
+            values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
+            values[self._still] = self._values[self._still]
+            self._values = values
+        across, up = self._along
+        ground.show(across, up, self._values)
+
+    def _move_crowd(self, trail: np.ndarray, moment: float) -> None:
         self._paths[0].set_data(*_joined(_thin(trail)))
+        if self._lawn and self._team is not None and self._team.moves:
+            for artist in self._lawn:
+                artist.remove()
+            self.moving = [artist for artist in self.moving if artist not in self._lawn]
+            self._lawn = self._plain(shapes(self._team, self._time(moment)), _between(self.x, moment)[0], moment)
+            self.moving += self._lawn
         margins = self._agent_margin[int(moment)]
         self._dots.set_offsets(trail[-1])
         self._dots.set_facecolor(self._shades(margins))
@@ -355,18 +386,19 @@ class Scene:
     def _shades(self, margins: np.ndarray) -> Any:
         return self._colours.to_rgba(np.ma.masked_invalid(margins))
 
-    def _bodies(self, x: np.ndarray, *, moving: bool) -> Iterator[Artist]:
-        """Regions in space with the team at x (N, d): those that move with agents, or those that stay."""
-        if self._team is None or self._shapes is None:
+    def _bodies(self, x: np.ndarray, moment: float, *, moving: bool) -> Iterator[Artist]:
+        """Regions in space with the team at x (N, d): those that move, or those that stay."""
+        team = self._then(moment)
+        if self._team is None or team is None or self._shapes is None:
             return
-        found, ties = self._shapes, moves(self._team)
-        chosen = [k for k in space.chosen(found) if (found.balls.around[k] >= 0) == moving]
+        found, ties = shapes(self._team, self._time(moment)) if self._team.moves else self._shapes, moves(self._team)
+        chosen = [k for k in space.chosen(found) if bool(found.balls.moves[k]) == moving]
         yield from space.balls(self.axes, found.balls, x, chosen, None if self._few else AREA)
         if not moving:
             yield from space.walls(self.axes, found.walls, self._low, self._high)
         others = [k for k in found.others.tolist() if ties[k] == moving]
         if self._few and others:
-            yield from space.sections(self.axes, self._team, others, x, self._low, self._high)
+            yield from space.sections(self.axes, team, others, x, self._low, self._high)
 
     def _agents(self, trail: np.ndarray) -> Iterator[Artist]:
         """A few agents in space."""

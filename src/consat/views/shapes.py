@@ -18,6 +18,8 @@ from consat.problem.team import Team
 BALLS: Final[Mapping[str, bool]] = {"within": False, "outside": True, "near": False, "apart": True, "displacement": False}
 """The kinds whose boundary is a ball, and whether it keeps its owner out."""
 WALLS: Final = ("halfspace", "box")
+WAYS: Final = 20
+"""Times at which moving balls are asked for, to find the view that holds their way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class Balls:
         around: (K,) the place in the team of the agent that they move with, or -1.
         radius: (K,).
         keeps_out: (K,) whether the owners must stay outside.
+        moves: (K,) whether they move, with an agent or by a schedule.
         owners: of each the places of its owners, ascending.
         number: (K,) the first of the constraints that each stands for.
     """
@@ -37,6 +40,7 @@ class Balls:
     around: np.ndarray
     radius: np.ndarray
     keeps_out: np.ndarray
+    moves: np.ndarray
     owners: tuple[tuple[int, ...], ...]
     number: np.ndarray
 
@@ -77,12 +81,13 @@ class Shapes:
     others: np.ndarray
 
 
-def shapes(team: Team) -> Shapes:
-    """The geometry of the constraints of a team."""
+def shapes(team: Team, time: float = 0.0) -> Shapes:
+    """The geometry of the constraints of a team at a time, s; the same balls and walls in the same order at every time."""
+    ties = moves(team)
     balls: dict[Hashable, list[Any]] = {}
     walls: dict[Hashable, list[Any]] = {}
     others: dict[Hashable, int] = {}
-    for key, family, k in _distinct(team):
+    for key, family, k in _distinct(team, time):
         number, owner = int(family.number[k]), int(family.owner[k])
         given = {name: value[k] for name, value in family.parameters.items()}
         if family.kind in BALLS and "radius" in given and family.sources is None:
@@ -103,6 +108,7 @@ def shapes(team: Team) -> Shapes:
             np.array([entry[1] for entry in balls.values()], dtype=int),
             np.array([entry[2] for entry in balls.values()], dtype=float),
             np.array([entry[3] for entry in balls.values()], dtype=bool),
+            np.array([ties[entry[5]] for entry in balls.values()], dtype=bool),
             tuple(tuple(sorted(entry[4])) for entry in balls.values()),
             np.array([entry[5] for entry in balls.values()], dtype=int),
         ),
@@ -126,10 +132,12 @@ def alike(team: Team) -> np.ndarray:
 
 
 def moves(team: Team) -> np.ndarray:
-    """(M,) whether the region of a constraint moves with teammates."""
+    """(M,) whether the region of a constraint moves, with teammates or by a schedule."""
     found = np.zeros(len(team.owner), dtype=bool)
     for family in team.families:
         found[family.number] = family.arity > 1
+        for track in family.tracks.values():
+            found[family.number[track.rows]] = True
     return found
 
 
@@ -148,10 +156,25 @@ def boxes(team: Team) -> np.ndarray:
     return np.unique(np.array(both, dtype=float).reshape(-1, 2, team.dimension), axis=0)
 
 
-def _distinct(team: Team) -> Iterator[tuple[Hashable, Family, int]]:
-    """Every constraint with a key that those with the same region share: function, parameters, and whom it reads besides its owner."""
-    for place, family in enumerate(team.families):
-        parameters = [np.ascontiguousarray(value) for _, value in sorted(family.parameters.items())]
+def ways(team: Team, times: np.ndarray) -> np.ndarray:
+    """(B, 2, d) boxes around the balls that move by schedules, at some times, s, of a run."""
+    found = [np.zeros((0, 2, team.dimension))]
+    if team.moves:
+        for time in times[:: max(1, len(times) // WAYS)].tolist():
+            balls = shapes(team, time).balls
+            which = balls.moves & (balls.around < 0)
+            center, radius = balls.center[which, None], balls.radius[which, None, None]
+            found.append(np.concatenate([center - radius, center + radius], axis=1))
+    return np.concatenate(found)
+
+
+def _distinct(team: Team, time: float = 0.0) -> Iterator[tuple[Hashable, Family, int]]:
+    """Every constraint, as it is at a time, with a key that those with the same region share: function, parameters at all times, and whom
+    it reads besides its owner."""
+    instants = team.instants
+    for place, family in enumerate(team.at(time).families):
+        told = [sorted(instant.families[place].parameters.items()) for instant in instants]
+        parameters = [np.ascontiguousarray(value) for each in told for _, value in each]
         for k in range(family.size):
             reads = tuple(-1 if agent == family.owner[k] else int(agent) for agent in family.agents[k])
             yield (place, reads, *(value[k].tobytes() for value in parameters)), family, k
