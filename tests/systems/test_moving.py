@@ -1,5 +1,6 @@
 """Constraints that move with time: schedules and expressions of t, followed by a run, and verdicts over its time."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def test_verdicts_cover_the_run_and_are_never_false(torn: cs.Result) -> None:
     assert [each["verdict"] for each in told] == ["feasible", "undecided", "infeasible", "undecided", "feasible"]
     assert told[0]["from"] == 0.0
     assert told[-1]["to"] == 10.0
-    assert all(a["to"] == b["from"] for a, b in zip(told[:-1], told[1:], strict=True))
+    assert all(a["to"] == b["from"] for a, b in itertools.pairwise(told))
     assert sum(each["to"] - each["from"] for each in told if each["verdict"] == "undecided") < 0.1
     for time in np.linspace(0, 10, 41).tolist():
         margin = max_min(team.at(time)).margin

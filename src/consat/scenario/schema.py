@@ -22,6 +22,7 @@ from consat.settings import Settings
 
 if TYPE_CHECKING:
     from consat.robots.description import Robots
+    from consat.robots.obstacles import Obstacle
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
@@ -120,29 +121,15 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
     agents = data.get("agents")
     if not any(key in data for key in ("robots", "obstacles")) and not _any_robot(agents):
         return None
-    from consat.robots.description import Robots, kind_of, model_of, obstacle_of
+    from consat.robots.description import Robots, kind_of, model_of
 
     own = [
         (i, entry) for i, entry in enumerate(agents if isinstance(agents, list) else []) if isinstance(entry, dict) and entry.get("robot")
     ]
     common, known = data.get("robots"), len(faults.found)
-    obstacles = data.get("obstacles")
-    if obstacles is not None and not isinstance(obstacles, list):
-        faults.add(
-            ("obstacles",), f"obstacles is {shown(obstacles)}, but must be a list such as [{{kind: disc, center: [0, 0], radius: 1}}]"
-        )
-        obstacles = None
-    made = [
-        each
-        for k, item in enumerate(obstacles or [])
-        if (each := _made(functools.partial(obstacle_of, item), ("obstacles", k), f"obstacles[{k}]", faults)) is not None
-    ]
-    for k, each in enumerate(made):
-        if isinstance(dimension, int) and each.dimension != dimension and 1 <= dimension <= 64:
-            message = f"it lies in {each.dimension} dimensions, but the team has {dimension}"
-            faults.add(("obstacles", k), message, f"obstacles[{k}]")
+    made = _obstacles(data.get("obstacles"), dimension, faults)
     if common is None and not own:
-        if obstacles:
+        if made:
             faults.add(("obstacles",), "there are obstacles, but no robots to keep clear of them; add robots: {kind: point}")
         return None
     base = common if isinstance(common, dict) else {"kind": "point"}
@@ -164,6 +151,25 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
             faults.add(path, f"{kind_of(model)} robots move in {allowed} dimensions, but the team has {dimension}", "robots")
             return None
     return Robots(whole, each_own, tuple(made))
+
+
+def _obstacles(data: Any, dimension: Any, faults: _Faults) -> list[Obstacle]:
+    from consat.robots.description import obstacle_of
+
+    if data is not None and not isinstance(data, list):
+        example = "[{kind: disc, center: [0, 0], radius: 1}]"
+        faults.add(("obstacles",), f"obstacles is {shown(data)}, but must be a list such as {example}")
+        data = None
+    made: list[Obstacle] = []
+    for k, item in enumerate(data or []):
+        each = _made(functools.partial(obstacle_of, item), ("obstacles", k), f"obstacles[{k}]", faults)
+        if each is None:
+            continue
+        made.append(each)
+        if isinstance(dimension, int) and each.dimension != dimension and 1 <= dimension <= 64:
+            message = f"it lies in {each.dimension} dimensions, but the team has {dimension}"
+            faults.add(("obstacles", k), message, f"obstacles[{k}]")
+    return made
 
 
 def _any_robot(agents: Any) -> bool:
