@@ -137,8 +137,9 @@ def polygon(vertices: Sequence[Sequence[float]]) -> Polygon:
             raise InvalidInput([Fault((*path, index), text, where)])
         seen[point] = index
     shape = shapely.Polygon(points)
-    if not shape.is_valid or shape.area == 0.0:
-        text = "lie on one line" if shape.area == 0.0 else _crossing(points)
+    flat = np.linalg.matrix_rank(points - points[0]) < 2
+    if flat or not shape.is_valid:
+        text = "lie on one line, but must enclose something" if flat else _crossing(points)
         raise InvalidInput([Fault(path, text, where)])
     return Polygon(tuple((float(x), float(y)) for x, y in points))
 
