@@ -1,5 +1,6 @@
 """Teams on their way: everybody arrives, nobody touches, and what happened is said."""
 
+import functools
 import itertools
 import re
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import shapely
 
 import consat.errors
+from consat.numerics import quick_compilation
 from consat.robots import Double, Drive, Planner, Point, Quadrotor, Unicycle, box, disc, polygon
 from consat.robots.neighbours import candidates, near
 from consat.robots.obstacles import map_of
@@ -23,7 +25,7 @@ def driven(drive: Drive, starts: Any, goals: Any, until: float, paths: Any = Non
     """State and memory after so many seconds."""
     targets = jnp.asarray(goals)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=quick_compilation())
     def run(state: Any, memory: Any) -> Any:
         def body(carry: Any, _: None) -> Any:
             return drive.step(*carry, targets, paths=paths)[:2], None

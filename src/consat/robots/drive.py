@@ -99,6 +99,7 @@ class Drive:
         map: the obstacles as arrays.
         size: (N,) the radius that each keeps round its place, m.
         range: how far each looks, m.
+        explained: how deep an overlap may seem by noise alone, m.
 
     Raises:
         InvalidInput: a setting, or an obstacle, that cannot be used.
@@ -119,6 +120,7 @@ class Drive:
     map: Map = field(init=False)
     size: np.ndarray = field(init=False)
     range: float = field(init=False)
+    explained: float = field(init=False)
 
     def __post_init__(self) -> None:
         faults = []
@@ -134,9 +136,10 @@ class Drive:
         if faults:
             raise InvalidInput(faults)
         object.__setattr__(self, "map", map_of(self.obstacles, self.dimension))
-        size, look = _sizes(self)
+        size, look, added = _sizes(self)
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "range", look)
+        object.__setattr__(self, "explained", 4.0 * added)
 
     def start(self, state: Any) -> Memory:
         """The memory at the start."""
@@ -187,10 +190,11 @@ class Drive:
         top = model.pace(self.count)
         known, around = near(memory.known, place, self.neighbours, self.range)
         memory = self._looked_at(state, memory, around)
-        planes = safety.neighbour_planes(place, stop, size, around, self.share)
+        planes = safety.neighbour_planes(place, stop, size, around, self.share, explained=self.explained)
         everything = planes
         if self.map.count:
-            everything = safety.joined(planes, safety.obstacle_planes(place, stop, size, self.map, self.parts, self.share))
+            walls = safety.obstacle_planes(place, stop, size, self.map, self.parts, share=self.share, explained=self.explained)
+            everything = safety.joined(planes, walls)
         if measured is not None:  # a robot moves by what it measures of itself
             everything = everything._replace(least=everything.least + along(everything.normals, true - place))
 
@@ -286,15 +290,16 @@ class Drive:
 
 
 @float64
-def _sizes(drive: Drive) -> tuple[np.ndarray, float]:
-    """`size` and `range`."""
+def _sizes(drive: Drive) -> tuple[np.ndarray, float, float]:
+    """`size`, `range`, and what is added to radii."""
     model, count, dt = drive.model, drive.count, drive.dt
     with jax.ensure_compile_time_eval():
-        size = np.asarray(model.size(count, dt)) + safety.margin(model, count, dt, drive.noise, drive.share)
+        added = safety.margin(model, count, dt, drive.noise, drive.share)
+        size = np.asarray(model.size(count, dt)) + added
         if drive.sensing is not None:
-            return size, drive.sensing
+            return size, drive.sensing, added
         look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
-        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count, dt)))
+        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count, dt))), added
 
 
 def longest_halt(model: Model[Any], count: int, dt: float) -> np.ndarray:

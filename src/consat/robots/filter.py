@@ -85,7 +85,7 @@ def open_way(model: Model[Any], state: Any, wish: Array, planes: Planes, dt: flo
     return nearest(wish, planes.normals, rows, jnp.linalg.norm(wish, axis=1))[0]
 
 
-def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, share: float = 1.0) -> Planes:
+def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, share: float = 1.0, *, explained: float = np.inf) -> Planes:
     """The planes between robots, from positions that were measured.
 
     Args:
@@ -94,6 +94,8 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
         size: (N,) the radius that each keeps.
         near: neighbours, in `place`.
         share: of the gap that two robots may use up together in a step.
+        explained: how deep an overlap may seem by noise alone, m. Who overlaps by more, which the theorem excludes, need not make up for it
+            at once, which may be out of reach, but comes no nearer.
     """
     there = near.who < len(place)
     index = jnp.minimum(near.who, len(place) - 1)
@@ -103,14 +105,16 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
     apart = own - other
     distance = jnp.sqrt(squared(apart))
     normals = apart / jnp.where(distance > 0.0, distance, 1.0)[..., None]
-    gap = distance - size[:, None] - size[index]
+    gap = _explained(distance - size[:, None] - size[index], explained)
     least = dot(normals, own) - 0.5 * share * gap
     length = jnp.zeros_like(size) if stop is None else jnp.sqrt(squared(stop - place))
     beyond = near.beyond - length - jnp.max(length, initial=0.0) - size - jnp.max(size, initial=0.0)
     return Planes(normals, jnp.where(there, least, VOID), jnp.maximum(0.5 * share * beyond, 0.0))
 
 
-def obstacle_planes(place: Array, stop: Array | None, size: Array, obstacles: Map, seen: int, share: float = 1.0) -> Planes:
+def obstacle_planes(
+    place: Array, stop: Array | None, size: Array, obstacles: Map, seen: int, *, share: float = 1.0, explained: float = np.inf
+) -> Planes:
     """The planes between robots and the `seen` convex parts of obstacles that are nearest; arguments as for `neighbour_planes`."""
     distance = obstacles.distances(place) - size[:, None]
     length = jnp.zeros_like(size) if stop is None else jnp.sqrt(squared(stop - place))
@@ -122,7 +126,7 @@ def obstacle_planes(place: Array, stop: Array | None, size: Array, obstacles: Ma
     apart = own - other
     gap = jnp.sqrt(squared(apart))
     normals = apart / jnp.where(gap > 0.0, gap, 1.0)[..., None]
-    least = dot(normals, own) - share * (gap - size[:, None])
+    least = dot(normals, own) - share * _explained(gap - size[:, None], explained)
     return Planes(normals, least, jnp.maximum(share * (beyond - length), 0.0))
 
 
@@ -139,6 +143,10 @@ def margin(model: Model[Any], count: int, dt: float, noise: float, share: float 
     """What is added to every body's radius so that positions may be wrong by up to `noise`, m; see docs/robots.md."""
     size, pace = np.asarray(model.size(count, dt)), np.asarray(model.pace(count))
     return HAIR + noise * (1.0 + np.sqrt(2.0) * pace.max() * dt / (share * size.min()))
+
+
+def _explained(gap: Array, explained: float) -> Array:
+    return jnp.where(gap < -explained, 0.0, gap)
 
 
 def _divisor(value: Array) -> Array:

@@ -80,7 +80,6 @@ def _near(known: Candidates, place: Array, seen: int) -> tuple[Array, Array, Arr
 
 
 def _largest(rows: Array, count: int) -> tuple[Array, Array]:
-    """The largest of each row and where they are. Without the barrier XLA makes of it, and of the slices that follow, a sort of whole
-    rows."""
+    """The largest of each row and where they are. Without the barrier XLA makes it, and the slices that follow, a sort of whole rows."""
     values, index = jax.lax.optimization_barrier(tuple(jax.lax.top_k(rows, count)))
     return values, index

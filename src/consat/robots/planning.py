@@ -11,6 +11,7 @@ import itertools
 import math
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
@@ -24,6 +25,8 @@ CORNERS = 2
 """Corners of a quarter circle that stands for that of a grown obstacle."""
 CELLS = 40_000
 """Of the grid in space, at most."""
+SAMPLES = 128
+"""Of a straight way in space, or a multiple of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +147,7 @@ class _Grid:
     """A grid in space whose free nodes are joined to their 26 neighbours."""
 
     def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
-        self.obstacles, self.size = obstacles, size
+        self.signed_distance, self.size = jax.jit(obstacles.signed_distance), size
         corners = np.concatenate(
             [obstacles.centers - obstacles.radii[:, None], obstacles.centers + obstacles.radii[:, None], obstacles.lows, obstacles.highs]
         )
@@ -175,13 +178,14 @@ class _Grid:
 
     @float64
     def _distance(self, points: np.ndarray) -> np.ndarray:
-        return np.asarray(self.obstacles.signed_distance(jnp.asarray(points)))
+        return np.asarray(self.signed_distance(jnp.asarray(points)))
 
     def _clear(self, first: np.ndarray, second: np.ndarray) -> bool:
         """Whether a body can go straight; the distance to the nearest obstacle is sampled so finely that it can't be missed by more than
         an eighth of the size, which paths keep clear."""
         length = float(np.linalg.norm(second - first))
-        part = np.linspace(0.0, 1.0, max(2, math.ceil(length / (0.25 * self.size)) + 1))[:, None]
+        samples = SAMPLES * math.ceil((length / (0.25 * self.size) + 1.0) / SAMPLES)  # few sizes, so that few programs are compiled
+        part = np.linspace(0.0, 1.0, samples)[:, None]
         return bool(np.all(self._distance(first + part * (second - first)) > 1.1 * self.size))
 
     def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
