@@ -122,7 +122,8 @@ class Consat:
                 paths = jnp.pad(paths, ((0, 0), (0, 16 - paths.shape[1]), (0, 0)), mode="edge")
                 memory = memory._replace(waypoint=jnp.zeros_like(memory.waypoint))
             if steps == 0:
-                jax.block_until_ready(chunk(state, memory, target, paths, path))  # compiles
+                warm = chunk(state, memory, target, paths, path)  # compiles
+                jax.block_until_ready(chunk(*warm[:2], target, paths, warm[2]))  # and once more, for what has no weak types
             begin = time.perf_counter()
             state, memory, path, taken = jax.block_until_ready(chunk(state, memory, target, paths, path))
             spent.append((time.perf_counter() - begin) / CHUNK)
