@@ -75,7 +75,8 @@ def limit_of(starts: np.ndarray, goals: np.ndarray) -> float:
     return 5.0 * np.linalg.norm(starts - goals, axis=1).max() / SPEED + 20.0
 
 
-CHUNK = 100
+CHUNK = 20
+"""Steps at a time; paths are planned anew after each."""
 
 
 class Consat:
@@ -231,11 +232,11 @@ def oracle(count: int) -> str:
             settings = solver.settings
             settings.eps_abs, settings.eps_rel, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = 1e-11, 0.0, 1e-12, 0.0
             solver.setup(np.eye(dimension), -wish[index], None, None, normals[index], least[index], np.full(rows, 1e30))
-            solved = solver.solve() != piqp.PIQP_PRIMAL_INFEASIBLE
-            infeasible += not solved
-            if solved != there[index]:
+            status = solver.solve()
+            infeasible += status == piqp.PIQP_PRIMAL_INFEASIBLE
+            if (status == piqp.PIQP_PRIMAL_INFEASIBLE) == there[index]:
                 differ += 1
-            elif solved:
+            elif status == piqp.PIQP_SOLVED:  # else it ran out of digits
                 worst = max(worst, float(np.abs(solver.result.x - found[index]).max()))
         done += block
     return (
@@ -448,7 +449,7 @@ Unicycles keep a radius of 0.15 m, the body and the steered point ahead of the a
 
 ## Among obstacles
 
-Random starts and goals among eight shelves and two pillars; paths are planned again every 5 s.
+Random starts and goals among eight shelves and two pillars; paths are planned again every second.
 
 {clutter}
 
