@@ -72,9 +72,9 @@ def picture() -> str:
         for k, room in enumerate(row)
     }
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {len(levels) * ROW + GAP - (ROW - HEIGHT) + GAP:g}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {len(levels) * ROW + GAP - (ROW - HEIGHT) + GAP:g}"',
         'font-family="sans-serif" role="img" aria-label="The rooms of consat and their imports">',
-        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">',
         '<path d="M0 0L8 4L0 8z" fill="#555"/></marker></defs>',
         f'<rect width="{width:g}" height="100%" fill="#fff"/>',
     ]
@@ -97,6 +97,7 @@ def picture() -> str:
 
 
 def main() -> None:
+    """Write the picture, or check it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     args = parser.parse_args()
