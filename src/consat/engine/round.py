@@ -112,11 +112,14 @@ class Weather:
         loss: probability that a message between two agents is lost, each direction by itself.
         sleep: probability that an agent skips a round: it computes and sends nothing, but hears.
         seed: of the draws.
+        burst: (p, q) for losses in bursts: a link, each direction by itself, turns bad in a round with probability p, and good again with
+            probability q; while it is bad nothing gets through (Gilbert 1960). None without.
     """
 
     loss: float = 0.0
     sleep: float = 0.0
     seed: int = 0
+    burst: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -202,6 +205,7 @@ class World:
         drive: the robots that bodies are; None of none.
         wind: (d,) velocity of the air, m/s; None where it is still.
         noise: the most that a measured position is wrong by, m; None where they are exact.
+        burst: (2,) see `Weather`; None without.
     """
 
     everyone: Everyone
@@ -219,6 +223,7 @@ class World:
     live: Live | None = None
     wind: Array | None = None
     noise: Array | None = None
+    burst: Array | None = None
     drive: Drive | None = field(default=None, metadata={"static": True})
 
     def at(self, round_: Array) -> World:
@@ -260,6 +265,7 @@ class Now(NamedTuple):
         key: of the random draws.
         heard: what they know of each other's bodies; None where bodies can jump.
         robots: what bodies are; None where they are points.
+        bad: (pairs,) between whom nothing gets through for now; None where losses do not come in bursts.
     """
 
     state: Any
@@ -268,6 +274,7 @@ class Now(NamedTuple):
     key: Array
     heard: agreement.Bodies | None = None
     robots: Driven | None = None
+    bad: Array | None = None
 
 
 class Spoken(NamedTuple):
@@ -285,6 +292,7 @@ class Spoken(NamedTuple):
         messages: sent.
         floats: sent.
         robots: likewise.
+        bad: likewise.
     """
 
     state: Any
@@ -298,6 +306,7 @@ class Spoken(NamedTuple):
     messages: Array
     floats: Array
     robots: Driven | None = None
+    bad: Array | None = None
 
 
 def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
@@ -314,11 +323,11 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
     state, message = protocol.speak(now.state, everyone, round_, known)
     ages, told = agreement.speak(now.ages, state.x, everyone)
-    key, went, awake, reached = now.key, None, None, None
+    key, went, awake, reached, bad = now.key, None, None, None, now.bad
     sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
     counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
     if world.rough:
-        key, awake, through = _luck(world, now.key)
+        key, awake, through, bad = _luck(world, now.key, now.bad)
         state = _where_awake(protocol.per, world, awake, state, now.state)
         ages = _where_awake(_AGES, world, awake, ages, now.ages)
         goes = awake[world.talker]
@@ -344,15 +353,15 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
         reached = talks if reached is None else talks & reached
         floats += jnp.sum(jnp.where(talks, everyone.interior.plan.floats, 0))
-    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats, robots)
+    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats, robots, bad)
 
 
 _AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
 _BODIES: Mapping[str, Any] = {"position": "row", "stale": "row", "ages": _AGES}
 
 
-def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
-    """The next key, (N,) who is awake, and (pairs,) between whom messages get through."""
+def _luck(world: World, key: Array, bad: Array | None) -> tuple[Array, Array, Array, Array | None]:
+    """The next key, (N,) who is awake, (pairs,) between whom messages get through, and between whom nothing does for now."""
     key, draw_loss, draw_sleep = jax.random.split(key, 3)
     part = world.part
     if part is None:
@@ -360,7 +369,12 @@ def _luck(world: World, key: Array) -> tuple[Array, Array, Array]:
     else:  # the same as in one process
         awake = jax.random.uniform(draw_sleep, (part.agents,))[part.agent]
         through = jax.random.uniform(draw_loss, (part.pairs,))[part.pair]
-    return key, awake >= world.sleep, through >= world.loss
+    arrives = through >= world.loss
+    if bad is not None and world.burst is not None:
+        turns = jax.random.uniform(jax.random.fold_in(draw_loss, 1), bad.shape)
+        bad = jnp.where(bad, turns >= world.burst[1], turns < world.burst[0])
+        arrives &= ~bad
+    return key, awake >= world.sleep, arrives, bad
 
 
 def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Array, Array]]:
@@ -378,7 +392,7 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Arr
     if heard is not None and word is not None and world.owners is not None:
         heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
     known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
-    now = Now(state, ages, spoken.body, spoken.key, heard, spoken.robots)
+    now = Now(state, ages, spoken.body, spoken.key, heard, spoken.robots, spoken.bad)
     return now, knowledge(protocol, world, now, known if world.part is None else known | ~world.part.ours)
 
 
@@ -476,7 +490,8 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
         state = world.drive.model.start(start)
         paths = jnp.repeat(start[:, None], PATH, axis=1) if world.drive.map.count else None
         robots = Driven(state, world.drive.start(state), paths)
-    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard, robots)
+    bad = None if world.burst is None else jnp.zeros(world.pairs, bool)
+    now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard, robots, bad)
     return now, see(world, now, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
 
 
@@ -518,7 +533,7 @@ def world_of(
         convex=convex,
         precision=precision_for(team.count),
     )
-    rough = weather.loss > 0 or weather.sleep > 0
+    rough = weather.loss > 0 or weather.sleep > 0 or weather.burst is not None
     keys = talker.astype(np.int64) * team.count + listener
     pairs = distinct(keys)
     if not (rough or partial):  # then nobody asks who is at the ends
@@ -538,6 +553,7 @@ def world_of(
         rough=rough,
         live=live,
         wind=jnp.asarray(body.wind, dtype=float) if body is not None and any(body.wind) else None,
+        burst=None if weather.burst is None else jnp.asarray(weather.burst, dtype=float),
         noise=jnp.asarray(body.noise) if body is not None and body.noise > 0 else None,
         drive=None if body is None else body.drive,
     )

@@ -64,6 +64,7 @@ class Options:
     wind: tuple[float, ...] = ()
     noise: float = 0.0
     restarts: int = 1
+    burst: tuple[float, float] | None = None
 
     @property
     def data(self) -> dict[str, Any]:
@@ -79,7 +80,8 @@ class Options:
             "smoothing": smoothing if smoothing in (None, "auto") else Smoothing.model_validate(smoothing),
             "robots": None if robots is None else Robots.of(robots),
         }
-        return cls(**{**data, "wind": tuple(data["wind"]), **made})
+        burst = None if data["burst"] is None else tuple(data["burst"])
+        return cls(**{**data, "wind": tuple(data["wind"]), "burst": burst, **made})
 
     def stop_for(self, kind: str) -> Stop:
         """When a run with a protocol ends before the time or the rounds are up."""
@@ -91,7 +93,7 @@ class Options:
 
     def require_flow(self, kind: str, team: Team) -> None:
         """Raises: InvalidSettings: there is something that continuous time does not know."""
-        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "rate", "speed", "robots", "wind", "noise")}
+        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise")}
         given["restarts"] = self.restarts - 1
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
@@ -103,7 +105,10 @@ class Options:
         """What goes wrong on the way. Raises: InvalidSettings: probabilities that are none."""
         if not (0 <= self.loss < 1 and 0 <= self.sleep < 1):
             raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
-        return Weather(self.loss, self.sleep, seed)
+        if self.burst is not None and not (len(self.burst) == 2 and all(0 < each <= 1 for each in self.burst)):
+            message = f"burst is {list(self.burst)}, but must be two probabilities, of a link's turning bad and of its turning good again"
+            raise InvalidSettings(message)
+        return Weather(self.loss, self.sleep, seed, self.burst)
 
     def _driven(self, team: Team, rate: float) -> dict[str, Any]:
         """What robots add to a body."""

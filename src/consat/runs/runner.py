@@ -47,6 +47,7 @@ def run(
     stop: Stop | None = None,
     loss: float = 0.0,
     sleep: float = 0.0,
+    burst: tuple[float, float] | None = None,
     rate: float | None = None,
     speed: float | None = None,
     robots: Any = None,
@@ -78,6 +79,8 @@ def run(
         stop: ``satisfied`` (default), ``converged`` or ``never``.
         loss: probability that a message is lost, in rounds.
         sleep: probability that an agent skips a round.
+        burst: ``(p, q)``: a link, each direction by itself, turns bad with probability p a round and good again with probability q; while
+            it is bad nothing gets through. In rounds.
         rate: rounds a second, Hz; by default `consat.runs.options.RATE` where constraints move with time, else rounds take no time.
         speed: the most that a body moves, length/s; positions then follow estimates. Without, bodies are where their agents want to be.
         robots: what bodies are, such as ``consat.Unicycle(radius=0.1)``: a model for all, a mapping from ids to models, or the name of a
@@ -109,6 +112,7 @@ def run(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
         wind=tuple(map(float, wind)), noise=noise, restarts=restarts,
+        burst=None if burst is None else tuple(map(float, burst)),  # type: ignore[arg-type]
     )  # fmt: skip
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
@@ -182,8 +186,8 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """What several processes can do."""
-    if options.restarts > 1 or options.robots is not None:
-        raise InvalidSettings("several processes run points, and from one start; use one process for robots and restarts")
+    if options.restarts > 1 or options.robots is not None or options.burst is not None:
+        raise InvalidSettings("several processes run points, from one start, and lose messages one by one; use one process for more")
     if kind in FLOWS or checkpoints:
         raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
     if team.moves:

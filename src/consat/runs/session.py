@@ -93,6 +93,7 @@ class Session:
         smoothing: as in `consat.run`.
         loss: probability that a message is lost.
         sleep: probability that an agent skips a round.
+        burst: of losses in bursts, as in `consat.run`.
         rate: rounds a second, Hz; what schedules, robots and `time` go by. By default that of the scenario, or 20.
         speed: the most that a body moves, length/s; None if bodies are where their agents want to be.
         robots: what bodies are, as in `consat.run`; a robot that joins later is like the first, if nobody says.
@@ -110,12 +111,13 @@ class Session:
     def __init__(
         self, team: Team | Scenario | str, *, protocol: str | None = None, estimates: Layout | None = None, seed: int | None = None,
         start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
+        burst: tuple[float, float] | None = None,
         rate: float | None = None, speed: float | None = None, robots: Any = None, obstacles: Sequence[Any] | None = None,
         wind: Sequence[float] = (), noise: float = 0.0,
     ) -> None:  # fmt: skip
         scenario = scenario_of(team)
         self._options = Options(
-            protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep,
+            protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, burst=burst,
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
             robots=asked(robots, obstacles, scenario.robots, scenario.team.ids),
         )  # fmt: skip
