@@ -31,6 +31,8 @@ AGENT_KEYS: Final = ("id", "start", "robot", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
 """Keys that constraints of a group have besides those of their kind."""
+TEXT: Final = (str, str | None, "str", "str | None")
+"""Arguments of a factory that are annotated so are text in a scenario file."""
 COMMUNICATION_KEYS: Final = ("links", "graph")
 
 
@@ -330,7 +332,7 @@ def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tup
     # What is needed and missing gets a stand-in. The team's complaint about it is dropped: its place has a fault already.
     given: dict[str, Any] = dict.fromkeys(needed, "")
     for key, parameter in keys.items():
-        text = besides is None if key == "agent" else "str" in str(parameter.annotation)
+        text = besides is None if key == "agent" else parameter.annotation in TEXT
         if key in data and text and not isinstance(data[key], str):
             faults.add((*path, key), f"{key} is {shown(data[key])}, but must be text; put numbers in quotes", where)
         elif key in data:
