@@ -82,9 +82,10 @@ class PairCore:
 
     def anew(self, state: PairState) -> PairState:
         """With a count of changes that is larger by one, and nothing proven."""
-        memory = state.inner.memory
-        memory = memory._replace(changes=memory.changes + 1.0, bound=jnp.full_like(memory.bound, jnp.inf))
-        return state._replace(inner=state.inner._replace(memory=memory), bounds=jnp.full_like(state.bounds, jnp.inf))
+        memory: Any = state.inner.memory
+        more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # nothing compiles
+        forgotten: Any = np.full(2, np.inf)
+        return state._replace(inner=state.inner._replace(memory=memory._replace(**more)), bounds=forgotten)
 
     def carry(self, other: Core, state: PairState, first: np.ndarray, time: float = 0.0) -> PairState:
         """Only the estimates live on, and the count of changes, which this is one of."""
