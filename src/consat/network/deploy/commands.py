@@ -200,12 +200,11 @@ def _after(stage: Stage, entry: Mapping[str, Any]) -> Timed:
     if command == "change":
         changes = changes_of(team, agent, entry["constraint"], given)
         team = (adjusted if is_adjustment(team, changes) else changed)(team, changes)
-    elif command == "leave":
-        present = present - {agent}
+    else:
+        present = present - {agent} if command == "leave" else present | {agent}
         if not present:
             raise InvalidTeam([Fault(("agent",), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
-    else:
-        present = present | {agent}
+        _require_connected(Stage(at, team, present), "agent", f"{'without' if command == 'leave' else 'with'} agent {agent!r}")
     return Timed(at, command, (agent,), entry.get("constraint", ""), given, Stage(at, team, present))
 
 
@@ -218,8 +217,13 @@ def _relinked(stage: Stage, command: str, agents: tuple[str, ...]) -> Team:
         raise InvalidTeam([Fault(("agents",), message, where)])
     links = np.concatenate([team.links, np.array([pair], dtype=np.int32)]) if command == "connect" else team.links[~there]
     new = team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))])
-    try:
-        require_connected(stage._replace(team=new).there()[0])
-    except InvalidTeam as error:
-        raise InvalidTeam([replace(fault, path=("agents",), where=f"without the {where}") for fault in error.faults]) from None
+    _require_connected(stage._replace(team=new), "agents", f"without the {where}")
     return new
+
+
+def _require_connected(stage: Stage, key: str, where: str) -> None:
+    """Raises: InvalidTeam: agents that depend on each other could not reach one another."""
+    try:
+        require_connected(stage.there()[0])
+    except InvalidTeam as error:
+        raise InvalidTeam([replace(fault, path=(key,), where=where) for fault in error.faults]) from None

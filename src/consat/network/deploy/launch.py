@@ -13,7 +13,7 @@ import numpy as np
 
 from consat.engine.rounds import HOLD, SETTLED
 from consat.errors import NetworkError
-from consat.network.deploy.commands import RELINK, Script, Stage, Timed, load_commands, no_commands
+from consat.network.deploy.commands import Script, Timed, load_commands, no_commands
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
 from consat.network.deploy.observer import Observer, Pace
@@ -271,36 +271,35 @@ class Crew:
     def _carry_out(self, command: Timed) -> bool:
         """Whether it is done; not while one who is to join again has not gone yet."""
         agent = command.agents[0]
-        if command.command in RELINK:
-            self._split_anew(command.after)
-        elif command.command == "change":
+        if command.command == "change":
             part = self._parts[agent]
             team = changed(part.team, changes_of(part.team, agent, command.constraint, command.parameters))
             self._parts[agent] = replace(part, team=team)
             self.fleet.write(agent, self._parts[agent])  # for when it crashes
             self.fleet.tell(agent, {"command": "change", "constraint": command.constraint, **command.parameters})
-        elif command.command == "leave":
+            return True
+        waits = agent in self._standby
+        if command.command == "join" and self.fleet.running(agent) and not waits:
+            return False
+        self._split_anew(command.after.there()[0])
+        if command.command == "leave":
             self.fleet.tell(agent, {"command": "leave"})
-        elif agent in self._standby:
+        elif waits:
             self._standby.remove(agent)
             self.fleet.tell(agent, {"command": "join"})
-        elif self.fleet.running(agent):
-            return False
-        else:
+        elif command.command == "join":
             self.start(agent)
         return True
 
-    def _split_anew(self, stage: Stage) -> None:
-        """New parts for all: who holds what, and along which links it travels, may be other than before."""
+    def _split_anew(self, team: Team) -> None:
+        """New parts for those who are there: who holds what, and along which links it travels, may be other than before."""
         self._generation += 1
-        scenario = replace(self._scenario, team=stage.team)
+        addresses = {agent: self._parts[agent].listen for agent in team.ids}
         run = next(iter(self._parts.values())).run
-        self._parts = split(
-            scenario, run=run, addresses={agent: part.listen for agent, part in self._parts.items()},
-            absent=frozenset(stage.team.ids) - stage.present, epoch=self.epoch, generation=self._generation,
-        )  # fmt: skip
-        for agent, part in self._parts.items():
-            self.fleet.write(agent, part)
+        scenario = replace(self._scenario, team=team)
+        self._parts |= split(scenario, run=run, addresses=addresses, epoch=self.epoch, generation=self._generation)
+        for agent in team.ids:
+            self.fleet.write(agent, self._parts[agent])
             self.fleet.tell(agent, {"command": "reload"})
 
 
