@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import consat as cs
-from consat.errors import InvalidTeam
+from consat.errors import InvalidSettings, InvalidTeam
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import Manner, Mode
+from consat.network.node.orders import KEYS, Orders, order_of
 from consat.network.node.part import read_part, split, write_part
 from consat.network.transports.memory import Air, Conditions
 from consat.numerics import CompileClock
+from consat.problem.changes import changes_of
 from consat.problem.objective import margins
+from consat.problem.schedule import Schedule
 from consat.scenario import loads
 from tests.networked.case_c import events
 
@@ -25,10 +31,13 @@ consat: 1
 agents:
   - {id: a1, start: [0, 0], constraints: [{kind: within, center: {times: [0, 4], values: [[0, 0], [4, 2]]}, radius: 1, name: goal}]}
   - {id: a2, start: [0, 1], constraints: [{kind: near, agent: a1, radius: 1.5}]}
-  - {id: a3, start: [0, 2], constraints: [{kind: expr, psi: "4 - norm2(a3 - [t, 0.5*t + 1])", name: track}, {kind: near, agent: a2, radius: 1.5}]}
+  - id: a3
+    start: [0, 2]
+    constraints: [{kind: expr, psi: "4 - norm2(a3 - [t, 0.5*t + 1])", name: track}, {kind: near, agent: a2, radius: 1.5}]
 communication: {graph: line}
 """
 STILL = ESCORT.replace("{times: [0, 4], values: [[0, 0], [4, 2]]}", "[0, 0]").replace("[t, 0.5*t + 1]", "[0, 1]")
+FUZZED = loads(STILL).team
 APART = STILL.replace("center: [0, 0]", "center: [20, 0]")
 
 
@@ -102,7 +111,7 @@ def test_lockstep_counts_time_in_rounds() -> None:
 
 def test_a_changed_constraint_counts_from_the_next_turn_and_compiles_nothing() -> None:
     """Infeasible, proven; not so any more, and satisfied; and proven again. No bound is false for the team that it is said of."""
-    best = cs.solve(loads(APART)).summary["bounds"][1]
+    best = cs.solve(loads(APART))["bounds"][1]
     team = team_of(APART, conditions=Conditions(loss=0.3))
     team.run(8.0, lambda: knows(team) == {"infeasible"})
     assert knows(team) == {"infeasible"}
@@ -114,10 +123,8 @@ def test_a_changed_constraint_counts_from_the_next_turn_and_compiles_nothing() -
     assert knows(team) == {"satisfied"}
     told = [event for event in events(team, "changed") if event["id"] == "a1"]
     assert [(event["constraint"], event["parameters"]) for event in told] == [("goal", {"center": [0, 0]})]
-    late = [
-        event["bound"] for event in events(team, "report") if event["id"] == "a1" and event["bound"] is not None and event["t"] > changed_at
-    ]  # type: ignore[operator]
-    assert all(bound > 0 for bound in late)
+    reports = [event for event in events(team, "report") if event["id"] == "a1" and event["bound"] is not None]
+    assert all(event["bound"] > 0 for event in reports if event["t"] > changed_at)  # type: ignore[operator]
     assert min(bounds(team)) >= best
     team.runners["a1"].change("goal", {"center": [20, 0]})
     team.run(8.0, lambda: knows(team) == {"infeasible"})
@@ -170,22 +177,76 @@ def settled() -> Rehearsal:
 def test_a_change_that_cannot_be_is_refused_and_nothing_changes(
     constraint: str, parameters: dict[str, Any], message: str, settled: Rehearsal
 ) -> None:
-    """The same words as a session has, and the same as before is said in the next turn."""
+    """In the words that a session has."""
     station = settled.runners["a1"].station
     before = station.part, station.core
-    with pytest.raises(InvalidTeam, match=message.replace("?", r"\?")) as network:
+    with pytest.raises(InvalidTeam, match=message.replace("?", r"\?")) as refused:
         settled.runners["a1"].change(constraint, parameters)
     with pytest.raises(InvalidTeam) as here:
-        session().change("a1", constraint, **parameters)
-    assert str(network.value) == str(here.value)
+        changes_of(loads(STILL).team, "a1", constraint, parameters)
+    assert str(refused.value) == str(here.value)
     assert (station.part, station.core) == before
     assert not events(settled, "changed")
 
 
-_SESSION: list[cs.Session] = []
+def test_lockstep_keeps_its_constraints() -> None:
+    team = team_of(STILL, "lockstep")
+    with pytest.raises(InvalidSettings, match="mode lockstep goes as consat run does"):
+        team.runners["a1"].change("goal", {"radius": 2})
 
 
-def session() -> cs.Session:
-    if not _SESSION:
-        _SESSION.append(cs.Session(loads(STILL)))
-    return _SESSION[0]
+def test_a_schedule_needs_a_clock() -> None:
+    team = team_of(STILL, epoch=None)
+    with pytest.raises(InvalidTeam, match="nobody has said when t = 0 is; start the agent with --epoch"):
+        team.runners["a1"].change("goal", {"radius": {"times": [0, 1], "values": [1, 2]}})
+
+
+def test_agents_of_another_split_are_not_understood() -> None:
+    """What they say may travel along other links; in the same split they find each other."""
+    team = team_of(STILL)
+    team.kill("a3")
+    team.parts = {**team.parts, "a3": dataclasses.replace(team.parts["a3"], generation=1)}
+    team.start("a3")
+    team.run(2.0)
+    assert team.runners["a2"].station.peers.dropped["problem"] > 0
+    assert not np.isfinite(team.runners["a2"].station.peers.all["a3"].heard)
+
+
+_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["a1", "goal", 10**400, -0.0, 1e101]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["times", "values", "x"]), inner, max_size=3),
+    max_leaves=6,
+)
+_ORDERS = st.dictionaries(
+    st.sampled_from(["command", "constraint", "center", "radius", "weight", "epoch", "agent"]) | st.text(max_size=4),
+    _VALUES | st.sampled_from(["change", "goal", "clock", "stop", "leave", "join", "reload"]),
+    max_size=5,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(_ORDERS | _VALUES)
+def test_whatever_an_order_is_it_is_understood_or_refused_in_one_line(told: Any) -> None:
+    order = order_of(told, "line")
+    if isinstance(order, str):
+        assert order
+        assert "\n" not in order
+        return
+    assert order.command in KEYS
+    if order.command == "change":
+        given = {key: value for key, value in order.given.items() if key != "constraint"}
+        with contextlib.suppress(InvalidTeam):
+            for change in changes_of(FUZZED, "a1", order.given["constraint"], given):
+                for value in change.given.values():
+                    arrays = (value.times, value.values) if isinstance(value, Schedule) else (value,)
+                    assert all(np.isfinite(array).all() for array in arrays)
+
+
+@pytest.mark.parametrize(
+    "line", ["{", "[" * 10**5, '{"command": 1e999}', "nan", '{"command": "chang"}', '{"command": "stop", "x": 1}', "\x00"]
+)
+def test_a_line_that_is_no_order_is_refused(line: str) -> None:
+    orders = Orders(2, reading=False)
+    assert orders._take(line)
+    assert not orders.stopped
+    assert not list(orders.others())
