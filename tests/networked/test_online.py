@@ -249,4 +249,4 @@ def test_a_line_that_is_no_order_is_refused(line: str) -> None:
     orders = Orders(2, reading=False)
     assert orders._take(line)
     assert not orders.stopped
-    assert not list(orders.others())
+    assert orders.next() is None

@@ -14,7 +14,9 @@ import math
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -116,19 +118,25 @@ def run_agent(part: Part, manner: Manner, around: Circumstances, again: Callable
         told = _wait_to_join(begin, orders, again) if around.standby else begin
         end = math.inf if around.until is None else time.monotonic() + around.until
         try:
-            while isinstance(told, Anew):
-                told = _live(told, manner, around, _Own(body, orders, helm, again, end))
-        finally:
+            with ThreadPoolExecutor(1) as reader:
+                own = _Own(body, orders, helm, again, reader, deque(), end)
+                while isinstance(told, Anew):
+                    told = _live(told, manner, around, own)
+        except BaseException:
             helm.stand()
+            raise
 
 
 class _Own(NamedTuple):
-    """What stays when the part is read again: the body, what the process is told, when it is to end, and who reads."""
+    """What stays when the part is read again: the body, what the process is told, who reads the part and in which thread, what is being
+    read, and when the process is to end."""
 
     body: Body
     orders: Orders
     helm: Helm
     again: Callable[[], Part] | None
+    reader: Executor
+    reading: deque[tuple[Order, Future[tuple[Part, Embodied] | str]]]
     end: float
 
 
@@ -181,30 +189,36 @@ def _loop(runner: Runner, transport: Transport, own: _Own, around: Circumstances
 
 
 def _obey(runner: Runner, own: _Own) -> Anew | None:
-    """Carry out what the process was told, and say what it does not do; with what it goes on, if it has read its part again."""
+    """Carry out what the process was told, and say what it does not do; with what it goes on, once it has read its part again.
+
+    While a part is read and compiled, in a thread of its own, the agent goes on as before; the orders that came after wait.
+    """
     station, orders = runner.station, own.orders
     for line, why in orders.rejected():
         station.log("rejected", line=line, why=why)
-    for order in orders.others():
-        told = _reread(station, own.again) if order.command == "reload" else _heed(runner, order)
-        if isinstance(told, Anew):
-            return told
-        if told is not None:
-            station.log("rejected", line=order.line, why=told)
+    while not own.reading:
+        if (order := orders.next()) is None:
+            break
+        if order.command == "reload":
+            own.reading.append((order, own.reader.submit(_renewed, station.part, station.core, own.again)))
+        elif (refusal := _heed(runner, order)) is not None:
+            station.log("rejected", line=order.line, why=refusal)
     if orders.leaving:
         orders.leaving = False
         own.helm.stand()
         station.log("leaving")
         runner.leave()
+    if own.reading and own.reading[0][1].done():
+        order, found = own.reading.popleft()
+        if isinstance(told := found.result(), tuple):
+            return _carried(station, *told)
+        station.log("rejected", line=order.line, why=told)
     return None
 
 
-def _reread(station: Station, again: Callable[[], Part] | None) -> Anew | str:
-    """Read the part again: what the agent goes on with, from the estimates that it has; or why it goes on as before."""
-    told = _renewed(station.part, station.core, again)
-    if isinstance(told, str):
-        return told
-    (part, core), known = told, station.estimates
+def _carried(station: Station, part: Part, core: Embodied) -> Anew:
+    """With what an agent goes on, from the estimates that it has."""
+    known = station.estimates
     first = [known.get(agent, row) for agent, row in zip(part.team.ids, part.first, strict=True)]
     return Anew(replace(part, first=np.array(first), epoch=station.epoch if part.epoch is None else part.epoch), core, station.membership)
 
@@ -260,7 +274,7 @@ def _wait_to_join(begin: Anew, orders: Orders, again: Callable[[], Part] | None)
     while not orders.stopped and not orders.leaving:
         for line, why in orders.rejected():
             write("rejected", line=line, why=why)
-        for order in orders.others():
+        while (order := orders.next()) is not None:
             told: Any = "the agent has not joined yet"
             if order.command == "join":
                 return Anew(part, core, Membership(part))

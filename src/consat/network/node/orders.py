@@ -98,10 +98,9 @@ class Orders:
         while self._measurements:
             yield self._measurements.popleft()
 
-    def others(self) -> Iterator[Order]:
-        """The orders but to stop and to leave, each once, in their order."""
-        while self._others:
-            yield self._others.popleft()
+    def next(self) -> Order | None:
+        """The next of the orders but to stop and to leave, each once; None where none waits."""
+        return self._others.popleft() if self._others else None
 
     def rejected(self) -> Iterator[tuple[str, str]]:
         """The lines that mean nothing, each once, and why."""
