@@ -13,10 +13,10 @@ import numpy as np
 
 from consat.engine.rounds import HOLD, SETTLED
 from consat.errors import NetworkError
-from consat.network.deploy.commands import Script, Timed, load_commands, no_commands
+from consat.network.deploy.commands import Script, Stage, Timed, load_commands, no_commands
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
-from consat.network.deploy.observer import Observer, Pace
+from consat.network.deploy.observer import Observer
 from consat.network.node.modes import DEFAULT_MODE, RATE, Manner, Mode, protocol_of
 from consat.network.node.part import Part, split
 from consat.network.node.problem import Alone
@@ -135,10 +135,9 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    stages = [script.begin, *(each.after for each in script.commands[: crew.done])]
-    team = stages[-1].there()[0]
-    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, stages, crew.pace)
-    if len(stages) > 1:  # what it was before is in the margins of the trace; verdicts over time are of a team that is not changed
+    team = crew.stage.there()[0]
+    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
+    if crew.done:  # what it was before is in the margins of the trace; verdicts over time are of a team that is not changed
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full) | {"mode": plan.mode, "network": observer.network()}
@@ -182,17 +181,16 @@ class Crew:
         parts: as they start.
 
     Attributes:
-        done: so many commands have been carried out.
+        stages: how the team stood, one after the other, and since when.
         epoch: when t = 0 was, s of Unix time; None before all are ready.
         ready: the same by the monotonic clock of this machine.
-        stage: how the team stands now.
     """
 
     def __init__(
         self, fleet: Fleet, observer: Observer, plan: Plan, scenario: Scenario, script: Script, parts: Mapping[str, Part]
     ) -> None:  # fmt: skip
         self.fleet, self.observer, self.plan = fleet, observer, plan
-        self.done, self.stage = 0, script.begin
+        self.stages = [script.begin]
         self.epoch: float | None = None
         self.ready: float | None = None
         self._scenario, self._script, self._parts = scenario, script, dict(parts)
@@ -201,16 +199,24 @@ class Crew:
         observer.present = script.begin.present
 
     @property
+    def stage(self) -> Stage:
+        """How the team stands now."""
+        return self.stages[-1]
+
+    @property
+    def done(self) -> int:
+        """How many commands have been carried out."""
+        return len(self.stages) - 1
+
+    @property
     def timed(self) -> bool:
         """Whether anything happens by the clock."""
         return bool(self._script.commands) or self.stage.team.moves
 
     @property
-    def pace(self) -> Pace:
-        """How time went."""
-        tick = 1.0 / (self.plan.rate or ROUNDS_A_SECOND) if self.timed else 1.0
-        origin = None if self.epoch is None or not self.timed or self.plan.mode == "lockstep" else self._stamp(self.epoch)
-        return Pace(origin, tick)
+    def tick(self) -> float:
+        """Of a round, s; one where nothing goes by time."""
+        return 1.0 / (self.plan.rate or ROUNDS_A_SECOND) if self.timed else 1.0
 
     @staticmethod
     def _stamp(unix: float) -> float:
@@ -228,7 +234,7 @@ class Crew:
         moving = float(team.knots.max(initial=0.0)) if len(team.knots) or not team.moves else WATCHED
         last = max([moving, *(each.at for each in self._script.commands)])
         if self.plan.mode == "lockstep":
-            return last / self.pace.tick
+            return last / self.tick
         return np.inf if self.epoch is None else self._stamp(self.epoch) + last
 
     def start(self, agent: str) -> None:
@@ -260,16 +266,17 @@ class Crew:
             if not all(seen.born is not None for seen in self.observer.seen.values()):
                 return
             self.epoch, self.ready = time.time(), time.monotonic()
+            if self.timed and self.plan.mode != "lockstep":
+                self.observer.origin = self.ready
             for agent in self.observer.team.ids if self.timed else ():
                 self.fleet.tell(agent, {"command": "clock", "epoch": self.epoch})
         commands, epoch = self._script.commands, self.epoch
         while self.done < len(commands) and time.time() - epoch >= commands[self.done].at and self._carry_out(commands[self.done]):
-            self.stage = commands[self.done].after
+            self.stages.append(commands[self.done].after._replace(since=time.time() - epoch))
             self.observer.present = self.stage.present
-            self.done += 1
 
     def _carry_out(self, command: Timed) -> bool:
-        """Whether it is done; not while one who is to join again has not gone yet."""
+        """Whether it is done; not before one who is to join is ready to."""
         agent = command.agents[0]
         if command.command == "change":
             part = self._parts[agent]
@@ -278,18 +285,21 @@ class Crew:
             self.fleet.write(agent, self._parts[agent])  # for when it crashes
             self.fleet.tell(agent, {"command": "change", "constraint": command.constraint, **command.parameters})
             return True
-        waits = agent in self._standby
-        if command.command == "join" and self.fleet.running(agent) and not waits:
+        if command.command == "join" and not self._is_ready(agent):
             return False
         self._split_anew(command.after.there()[0])
-        if command.command == "leave":
-            self.fleet.tell(agent, {"command": "leave"})
-        elif waits:
-            self._standby.remove(agent)
-            self.fleet.tell(agent, {"command": "join"})
-        elif command.command == "join":
-            self.start(agent)
+        if command.command in ("leave", "join"):
+            self._standby -= {agent}
+            self.fleet.tell(agent, {"command": command.command})
         return True
+
+    def _is_ready(self, agent: str) -> bool:
+        """Whether one who is to join stands by; it is started if it does not run."""
+        if agent not in self._standby and not self.fleet.running(agent):  # it has left before
+            self._standby.add(agent)
+            self.observer.seen[agent].born = None
+            self.start(agent)
+        return agent in self._standby and self.observer.seen[agent].born is not None
 
     def _split_anew(self, team: Team) -> None:
         """New parts for those who are there: who holds what, and along which links it travels, may be other than before."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -100,18 +100,6 @@ class Seen:
         return float(np.abs(places - places[-1]).max())
 
 
-class Pace(NamedTuple):
-    """How time goes.
-
-    Attributes:
-        origin: the stamp at t = 0; None where nothing moves and nothing is changed, and for rounds.
-        tick: of a round, s.
-    """
-
-    origin: float | None
-    tick: float
-
-
 class Observer:
     """Watches a team through its logs.
 
@@ -122,10 +110,12 @@ class Observer:
 
     Attributes:
         present: who is there now.
+        origin: the stamp at t = 0; None where nothing goes by it: then time is counted from the first stamp.
     """
 
     def __init__(self, team: Team, start: np.ndarray, clock: str) -> None:
         self.team, self.clock, self.present = team, clock, frozenset(team.ids)
+        self.origin: float | None = None
         self.seen = {agent: Seen() for agent in team.ids}
         self._start = start
 
@@ -182,7 +172,7 @@ class Observer:
         }
 
     def trace(
-        self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], pace: Pace
+        self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], tick: float
     ) -> Trace:  # fmt: skip
         """All of it as a trace, of the agents that are there at the end. Positions between two stamps are those at the earlier one.
 
@@ -192,9 +182,9 @@ class Observer:
             ending: why the run ended.
             seconds: spent.
             stages: how the team stood, one after the other.
-            pace: of time.
+            tick: of a round, s.
         """
-        begin = self._begin() if pace.origin is None else pace.origin
+        begin = self._begin()
         end = max([begin, *(seen.stamps[-1] for seen in self.seen.values() if seen.stamps)])
         if self.clock == "round":
             stamps = steps = np.arange(int(end) + 1, dtype=float)
@@ -202,8 +192,8 @@ class Observer:
             stamps = np.append(np.arange(begin, end, SAMPLE), end)
             steps = stamps - begin
         position = np.stack([self._along(seen, row, stamps) for seen, row in zip(self.seen.values(), self._start, strict=True)], axis=1)
-        dt = pace.tick if self.clock == "round" else SAMPLE
-        times = steps * (pace.tick if self.clock == "round" else 1.0)
+        dt = tick if self.clock == "round" else SAMPLE
+        times = steps * (tick if self.clock == "round" else 1.0)
         margins, smooth = _seen(stages, position, times, nu)
         final, there = stages[-1].there()
         sent = sum((seen.sent for seen in self.seen.values()), Counter[str]())
@@ -229,7 +219,7 @@ class Observer:
             known=self.all_known()[0],
             known_from=self._known_from(),
             seconds=seconds,
-            period=pace.tick if self.clock == "round" and final.moves else None,
+            period=tick if self.clock == "round" and final.moves else None,
             violated=shares_of(final, position) if still else None,
             motion=None if still else _motion(times, margin),
         )
@@ -242,7 +232,9 @@ class Observer:
         return int(since) if self.clock == "round" else since - self._begin()
 
     def _begin(self) -> float:
-        """The first stamp."""
+        """The stamp from which time is counted."""
+        if self.origin is not None:
+            return self.origin
         return min((seen.stamps[0] for seen in self.seen.values() if seen.stamps), default=0.0)
 
     def _along(self, seen: Seen, start: np.ndarray, stamps: np.ndarray) -> np.ndarray:
