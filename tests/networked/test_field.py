@@ -8,18 +8,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from consat.errors import InvalidSettings
 from consat.network.deploy import process
 from consat.network.deploy.process import Circumstances, run_agent
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.helm import PERIOD, VALID
 from consat.network.node.modes import Manner
-from consat.network.node.part import split
+from consat.network.node.part import Part, split
 from consat.network.node.station import Station
 from consat.network.transports.memory import Air, Conditions
 from consat.numerics import float64
@@ -181,12 +183,13 @@ class Waiting:
         time.sleep(seconds)
 
 
-def run(**around: Any) -> None:
+def run(again: Callable[[], Part] | None = None, **around: Any) -> None:
     part = split(SOLO, run="solo")["solo"]
     run_agent(
         part,
         Manner("admm", around.pop("rate", 20.0), turns=around.pop("turns", None)),
         Circumstances(**{"sensor": "stdin", "speed": 0.5, "until": PATIENCE} | around),
+        again,
     )
 
 
@@ -305,7 +308,7 @@ def test_a_robot_never_measured_is_told_of_once(robot: Robot) -> None:
 REFUSED = {
     "what is this": "it is no JSON",
     "[1, 2]": 'it must be {"position": [...]}',
-    '{"command": "fly"}': 'it must be {"position": [...]}',
+    '{"command": "fly"}': "there is no command 'fly'; the commands are stop, leave",
     "[" * 9999: "it is no JSON",
     '{"position": [3, NaN]}': "position must be a list of 2 finite numbers",
     '{"position": [3, Infinity]}': "position must be a list of 2 finite numbers",
@@ -352,3 +355,80 @@ def test_word_of_a_body_is_of_the_version_and_the_size_that_both_know() -> None:
     assert station.core.width == station.core.core.width + 4
     assert np.isfinite(station.core.largest[-4:]).all()
     assert parts()["a2"].team.dimension == 2
+
+
+# -- orders --------------------------------------------------------------------------------------------------------------------------------
+
+
+def say_in_turn(robot: Robot, lines: list[Any]) -> None:
+    """One line after the other, each when there was an answer to the one before; the last ends the agent."""
+    left = iter([*lines, {"command": "stop"}])
+
+    def script(robot: Robot) -> None:
+        if robot.told[-1]["event"] in ("start", "changed", "rejected", "clock"):
+            robot.say(next(left))
+
+    robot.script = script
+
+
+def test_orders_are_answered_one_by_one(robot: Robot) -> None:
+    say_in_turn(robot, [
+        {"command": "change", "constraint": "within", "center": [1, 0], "radius": 2},
+        {"command": "change", "constraint": "within", "center": [1]},
+        {"command": "change", "constraint": "within", "center": {"times": [0, 1], "values": [[0, 0], [1, 1]]}},
+        {"command": "clock", "epoch": 1e9},
+        {"command": "change", "constraint": "within", "center": {"times": [0, 1], "values": [[0, 0], [7, 7]]}},
+        {"command": "join"},
+        {"command": "reload"},
+    ])  # fmt: skip
+    run(sensor="simulated", attached=True)
+    assert [event["parameters"] for event in robot.of("changed")] == [
+        {"center": [1, 0], "radius": 2}, {"center": {"times": [0, 1], "values": [[0, 0], [7, 7]]}},
+    ]  # fmt: skip
+    assert [event["why"] for event in robot.of("rejected")] == [
+        "agent 'solo', constraint 'within': center has 1 entry, but must have 2, one for each dimension of the team",
+        "agent 'solo', constraint 'within': it moves with time, but nobody has said when t = 0 is; start the agent with --epoch",
+        "the agent is in the team already",
+        "the agent was started from a scenario; only a part of its own can be read again",
+    ]
+
+
+def test_a_part_that_was_written_anew_is_read_and_gone_on_with(robot: Robot) -> None:
+    """From where the agent is, without a stop; one of another agent is refused."""
+    part = split(SOLO, run="solo")["solo"]
+    moved = replace(part, generation=1, team=split(loads(SOLO.text.replace("[0, 0]", "[9, 1]")), run="solo")["solo"].team)
+    parts = iter([replace(part, me="other"), moved])
+
+    def script(robot: Robot) -> None:
+        now = robot.told[-1]
+        if now["event"] in ("start", "rejected") and len(robot.of("start")) < 2:
+            robot.say({"command": "reload"})
+        elif now["event"] == "report" and len(robot.of("start")) == 2 and now["margin"] is not None and now["margin"] > 0:
+            robot.say({"command": "stop"})
+
+    robot.script = script
+    run(lambda: next(parts), sensor="simulated", attached=True, speed=5.0)
+    assert [event["why"] for event in robot.of("rejected")] == ["agent is 'other', but must stay 'solo'"]
+    assert len(robot.of("start")) == 2
+    assert [event["why"] for event in robot.of("end")] == ["told to stop"]
+    np.testing.assert_allclose(robot.of("report")[-1]["position"], [9, 1], atol=1.0)
+
+
+def test_one_on_standby_joins_when_told(robot: Robot) -> None:
+    lines = iter([{"command": "change", "constraint": "within", "radius": 2}, {"command": "join"}, {"command": "stop"}])
+
+    def script(robot: Robot) -> None:
+        if robot.told[-1]["event"] in ("standby", "rejected", "start"):
+            robot.say(next(lines))
+
+    robot.script = script
+    run(sensor="simulated", standby=True)
+    assert [event["event"] for event in robot.told if event["event"] in ("standby", "rejected", "start", "end")] == [
+        "standby", "rejected", "start", "end",
+    ]  # fmt: skip
+
+
+def test_constraints_that_move_need_somebody_to_say_when() -> None:
+    moving = loads(SOLO.text.replace("[0, 0]", "{times: [0, 1], values: [[0, 0], [1, 1]]}"))
+    with pytest.raises(InvalidSettings, match="nobody says when t = 0 is; say --epoch"):
+        run_agent(split(moving)["solo"], Manner("admm"), Circumstances())

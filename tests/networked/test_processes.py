@@ -65,6 +65,26 @@ def off(heard: list[Event]) -> float:
     )
 
 
+def test_a_launch_carries_out_timed_commands(tmp_path: Path) -> None:
+    """A goal is moved, a link comes, one goes, and an agent leaves: those who stay find each other again, and the result is of them."""
+    file = tmp_path / "commands.yaml"
+    file.write_text(
+        "- {at: 0.3, agent: a1, command: change, constraint: goal, center: [1, 4]}\n"
+        "- {at: 0.6, command: connect, agents: [a1, a3]}\n"
+        "- {at: 0.9, command: disconnect, agents: [a2, a3]}\n"
+        "- {at: 1.2, agent: a3, command: leave}\n"
+    )
+    command = [*CONSAT, "launch", "case-c", "--commands", str(file), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START, check=False)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["status"], result["known"], result["ending"]) == ("satisfied", "satisfied", "satisfied")
+    assert set(result["positions"]) == {"a1", "a2"}
+    assert np.hypot(*np.subtract(result["positions"]["a1"], [1, 4])) < 1
+    assert [each["name"] for each in result["agents"]["a2"]["constraints"]] == ["near(a1)"]
+    assert result["motion"]["duration"] > 1.2
+
+
 def test_launch_gathers_a_result_as_any_run() -> None:
     done = subprocess.run(
         [*CONSAT, "launch", "case-c", "--mode", "admm", "--loss", "0.3", "--json"],

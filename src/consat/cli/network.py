@@ -49,6 +49,9 @@ loss_option = click.option(
 )
 until_option = click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="When to stop.")
 rounds_option = click.option("--rounds", type=click.IntRange(min=1), help="After how many turns to stop.")
+epoch_option = click.option(
+    "--epoch", type=float, metavar="UNIX-SECONDS", help="When t = 0 is, for constraints that move; to all agents the same."
+)
 keys_option = click.option(
     "--keys", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Of consat keys; if not given, `keys` beside FILE."
 )
@@ -102,10 +105,11 @@ delay_option = click.option("--delay", type=_Delay(), default=(0.0, 0.0), help="
 @protocol_option
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
+@epoch_option
 def split(
     *, scenario: str, overrides: tuple[str, ...], out: Path,
     addresses: tuple[str, ...], port: int, absent: tuple[str, ...], run: str | None,
-    protocol: str | None, estimates: str | None, seed: int | None,
+    protocol: str | None, estimates: str | None, seed: int | None, epoch: float | None,
 ) -> None:  # fmt: skip
     """Write one private file for each agent.
 
@@ -122,7 +126,7 @@ def split(
     if bad := [agent for agent, equals, _ in pairs if not equals]:
         raise click.UsageError(f"--address {bad[0]!r} must be ID=ADDRESS, such as a2=tcp/192.168.0.7:7447")
     with located(loaded):
-        parts = split_scenario(loaded, run=run, addresses={agent: to for agent, _, to in pairs}, port=port, absent=absent)
+        parts = split_scenario(loaded, run=run, addresses={agent: to for agent, _, to in pairs}, port=port, absent=absent, epoch=epoch)
         texts = {agent: write_part(part) for agent, part in parts.items()}
     out.mkdir(parents=True, exist_ok=True)
     for agent, text in texts.items():
@@ -157,6 +161,8 @@ def split(
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Of loss and delay.")
 @keys_option
 @click.option("--attached", is_flag=True, help="Read orders from stdin, and stop when it ends.")
+@click.option("--standby", is_flag=True, help="Wait for the order to join, on stdin.")
+@epoch_option
 @port_option
 def agent(
     *, scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
@@ -169,6 +175,7 @@ def agent(
     prepare_own(exact=mode == "lockstep")
     from consat.network.deploy.process import Circumstances, run_agent
     from consat.network.node.modes import Manner, mode_for
+    from consat.network.node.part import is_part, load_text, read_part
 
     speed = around.pop("speed")
     part = _part(scenario, agent, overrides, port, mode)
@@ -178,9 +185,10 @@ def agent(
     position = around["position"]
     if position is not None and len(position) != part.team.dimension:
         raise click.UsageError(f"--position has {counted(len(position), 'number')}, but must have {part.team.dimension}")
-    run_agent(
-        part, manner, Circumstances(speed=math.inf if speed is None else speed, keys=_keys(keys, scenario, [agent]), **around)
-    )  # fmt: skip
+    file = Path(scenario)
+    again = (lambda: read_part(load_text(file), scenario)) if file.is_file() and is_part(load_text(file), scenario) else None
+    around |= {"speed": math.inf if speed is None else speed, "keys": _keys(keys, scenario, [agent])}
+    run_agent(part, manner, Circumstances(**around), again)
     return DONE
 
 
@@ -199,6 +207,9 @@ def agent(
 @rounds_option
 @until_option
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; by itself if nothing is said.")
+@click.option(
+    "--commands", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="FILE", help="Timed changes: YAML or JSON lines."
+)
 @keys_option
 @out_option
 @force_option

@@ -230,15 +230,8 @@ class World:
         """With the constraints as they are after so many rounds."""
         if self.live is None:
             return self
-        values, everyone = self.live.at(round_), self.everyone
-        interior = everyone.interior if everyone.interior is None else replace(
-            everyone.interior, plan=everyone.interior.plan.with_parameters(values)
-        )  # fmt: skip
-        everyone = replace(
-            everyone, local=everyone.local.with_parameters(values), interior=interior,
-            plan=None if everyone.plan is None else everyone.plan.with_parameters(values),
-        )  # fmt: skip
-        return replace(self, everyone=everyone, observer=self.observer.with_parameters(values))
+        values = self.live.at(round_)
+        return replace(self, everyone=self.everyone.with_parameters(values), observer=self.observer.with_parameters(values))
 
 
 class Driven(NamedTuple):

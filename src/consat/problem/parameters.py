@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
@@ -113,7 +112,7 @@ def still(parameter: Parameter, dimension: int, path: Path, key: str, where: str
     if isinstance(parameter, Fixed):
         try:
             return np.asarray(parameter.value, dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             faults.append(Fault(path, f"{key} must be a number or an array of numbers, but is {parameter.value!r}", where))
             return None
     if isinstance(parameter, Number):
@@ -158,7 +157,7 @@ def number(parameter: Number, path: Path, key: str, where: str, faults: list[Fau
     want = "a positive number" if parameter.positive else "a number"
     if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
         value = value.item()
-    if not is_number(value) or not math.isfinite(value) or abs(value) > LARGEST:
+    if not is_number(value) or not abs(value) <= LARGEST:
         faults.append(Fault(path, f"{key} is {shown(value)}, but must be {want}{_limit(value)}", where))
         return None
     if parameter.positive and value < 1 / LARGEST:
@@ -176,7 +175,7 @@ def vector(value: Any, dimension: int, path: Path, key: str, where: str, faults:
     elif dimension and len(entries) != dimension:
         message = f"{key} has {counted(len(entries), 'entry', 'entries')}, but must have {dimension}, one for each dimension of the team"
         faults.append(Fault(path, message, where))
-    elif bad := [entry for entry in entries if not is_number(entry) or not math.isfinite(entry) or abs(entry) > LARGEST]:
+    elif bad := [entry for entry in entries if not is_number(entry) or not abs(entry) <= LARGEST]:
         faults.append(Fault(path, f"{key} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}", where))
     else:
         return np.array(entries, dtype=float)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -160,6 +160,12 @@ class LocalSolver:
     hops: int = field(metadata={"static": True})
     convex: bool = field(metadata={"static": True})
     precision: prox.Precision = field(metadata={"static": True})
+
+    def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Self:
+        """The same with other parameters of the constraints; of each family those that are given, (M_f, …)."""
+        interior = self.interior and replace(self.interior, plan=self.interior.plan.with_parameters(values))
+        plan = self.plan and self.plan.with_parameters(values)
+        return replace(self, local=self.local.with_parameters(values), interior=interior, plan=plan)
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
         assert self.plan is not None, "of a protocol that takes proximal steps"

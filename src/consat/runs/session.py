@@ -7,7 +7,7 @@ and go: then rounds are compiled once more, and everybody goes on with what they
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -24,14 +24,14 @@ from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Body, Now, World, world_of
 from consat.engine.rounds import Tally, driven, known_of
-from consat.errors import Fault, InvalidSettings, InvalidTeam, closest, shown
+from consat.errors import Fault, InvalidSettings, InvalidTeam, shown
 from consat.numerics import float64
-from consat.problem.constraints.library import ADJUSTABLE, adjustable
-from consat.problem.constraints.record import Number, Vector, flatten
+from consat.problem.changes import changed, changes_of, is_adjustment, is_structural, named, place_of
+from consat.problem.constraints.library import ADJUSTABLE
+from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
-from consat.problem.parameters import checked, still, vector
-from consat.problem.schedule import Schedule
+from consat.problem.parameters import vector
 from consat.problem.team import Agent, Team
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
@@ -228,24 +228,17 @@ class Session:
         """
         if not parameters:
             return self
-        sides = self._sides(agent, constraint, parameters)
-        changes = [(number, self._checked(number, given)) for number, given in sides]
-        slots = [(self._engine.family[number], self._engine.member[number]) for number, _ in changes]
-        families = self._engine.ready.team.families
-        structural = any(
-            key == "weight" or isinstance(value, Schedule) or self._moves(families[f], key, m)
-            for (f, m), (_, given) in zip(slots, changes, strict=True)
-            for key, value in given.items()
-        )  # fmt: skip
-        if structural or any(families[f].psi not in ADJUSTABLE for f, _ in slots):
-            team = _with_parameters(self.team, changes)
-            if structural or self._bends_otherwise(team):
-                self._restructure(team)
+        team = self.team
+        changes = changes_of(team, agent, constraint, parameters)
+        if not is_adjustment(team, changes):
+            new = changed(team, changes)
+            if is_structural(team, changes) or self._bends_otherwise(new):
+                self._restructure(new)
                 return self
-        for (f, m), (_, given) in zip(slots, changes, strict=True):
-            for key, value in given.items():
-                self._engine.live.parameters[f][key][m] = value
-        self._note_changes({int(self._engine.ready.team.owner[number]) for number, _ in changes})
+        for change in changes:
+            for key, value in change.given.items():
+                self._engine.live.parameters[change.family][key][change.member] = value
+        self._note_changes({int(team.owner[change.number]) for change in changes})
         return self
 
     @float64
@@ -368,8 +361,8 @@ class Session:
         Raises:
             InvalidTeam: there is none of this name; the session is as it was.
         """
-        numbers = self._named(agent, constraint)
         team, i = self.team, self._place_of(agent)
+        numbers = named(team, agent, constraint)
         gone = {team.names[number] for number in numbers}
         agents = list(team.agents)
         agents[i] = dataclasses.replace(agents[i], constraints=[each for each in flatten(agents[i].constraints) if each.name not in gone])
@@ -493,11 +486,7 @@ class Session:
         return body[copies.position], body
 
     def _place_of(self, agent: str) -> int:
-        ids = self._engine.ready.team.ids
-        found = next((k for k, each in enumerate(ids) if each == agent), None)
-        if found is None:
-            raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(agent, ids)}", f"agent {shown(agent)}")])
-        return found
+        return place_of(self._engine.ready.team, agent)
 
     def _pair(self, one: str, other: str) -> tuple[int, int]:
         i, j = self._place_of(one), self._place_of(other)
@@ -515,74 +504,6 @@ class Session:
             require_connected(team)
         except InvalidTeam as error:
             raise InvalidTeam([dataclasses.replace(fault, where=without) for fault in error.faults]) from None
-
-    def _named(self, agent: str, constraint: str) -> list[int]:
-        """The places of an agent's constraint of this name; of all sides of a box."""
-        team, i = self._engine.ready.team, self._place_of(agent)
-        low, high = np.searchsorted(team.owner, [i, i + 1])
-        names = {team.names[k]: k for k in range(int(low), int(high))}
-        if constraint in names:
-            return [names[constraint]]
-        sides = [k for name, k in names.items() if name.startswith((f"{constraint}.low[", f"{constraint}.high["))]
-        if not sides:
-            own = ", ".join(map(repr, list(names)[:8])) or "none"
-            message = f"there is no constraint {shown(constraint)}{closest(constraint, names)}; it has {own}"
-            raise InvalidTeam([Fault((), message, f"agent {agent!r}")])
-        return sides
-
-    def _sides(self, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[tuple[int, Mapping[str, Any]]]:
-        """Which constraints are changed, and which of their parameters; of a box ``low`` and ``high`` are those of its sides."""
-        numbers = self._named(agent, constraint)
-        if len(numbers) == 1:
-            return [(numbers[0], parameters)]
-        team, where = self._engine.ready.team, f"agent {agent!r}, constraint {constraint!r}"
-        if unknown := [key for key in parameters if key not in ("low", "high", "weight")]:
-            raise InvalidTeam([Fault((), f"there is no parameter {unknown[0]!r}; it has low, high and weight", where)])
-        own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
-        limits = {side: parameters.get(side, self._parameter(k, side)) for side, k in own.items()}
-        faults: list[Fault] = []
-        checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
-        if faults:
-            raise InvalidTeam(faults)
-        return [
-            (k, given)
-            for k in numbers
-            if (given := {key: value for key, value in parameters.items() if key == "weight" or f".{key}[" in team.names[k]})
-        ]
-
-    def _parameter(self, number: int, key: str) -> np.ndarray:
-        f, m = self._engine.family[number], self._engine.member[number]
-        return np.asarray(self._engine.live.parameters[f][key])[m]
-
-    def _checked(self, number: int, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The values of changed parameters, as arrays or schedules. Raises: InvalidTeam."""
-        team = self._engine.ready.team
-        family = team.families[self._engine.family[number]]
-        where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
-        faults: list[Fault] = []
-        values: dict[str, Any] = {}
-        allowed = adjustable(family.psi, family.parameters)
-        for key, value in given.items():
-            if key not in allowed and key != "weight":
-                names = ", ".join([*allowed, "weight"])
-                faults.append(Fault((key,), f"there is no parameter {key!r} to change{closest(key, allowed)}; it has {names}", where))
-                continue
-            parameter = dataclasses.replace(allowed.get(key, _WEIGHT), value=value)
-            found = (still if key == "weight" else checked)(parameter, team.dimension, (key,), key, where, faults)
-            if found is None:
-                continue
-            shape = family.parameters[key].shape[1:] if key != "weight" else ()
-            if (found.values.shape[1:] if isinstance(found, Schedule) else found.shape) != shape:
-                faults.append(Fault((key,), f"{key} is {shown(value)}, but must have shape {shape}", where))
-            values[key] = found
-        if faults:
-            raise InvalidTeam(faults)
-        return values
-
-    @staticmethod
-    def _moves(family: Any, key: str, member: int) -> bool:
-        track = family.tracks.get(key)
-        return track is not None and track.schedule(int(member)) is not None
 
     def _bends_otherwise(self, team: Team) -> bool:
         """Whether what was compiled of the curvature of constraints does not hold of a team with other parameters."""
@@ -608,24 +529,6 @@ class Session:
 def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:
     """A team with other agents, and with more links."""
     return Team(agents, [*team.linked, *links], team.dimension, unit=team.unit)
-
-
-_WEIGHT = Number(None, positive=True)
-
-
-def _with_parameters(team: Team, changes: Sequence[tuple[int, Mapping[str, Any]]]) -> Team:
-    """The team with other parameters, weights and schedules of some constraints, by their numbers."""
-    agents = list(team.agents)
-    start = np.searchsorted(team.owner, team.owner)
-    for number, given in changes:
-        i = int(team.owner[number])
-        own = list(flatten(agents[i].constraints))
-        k = number - int(start[number])
-        old = own[k]
-        parameters = {key: dataclasses.replace(each, value=given[key]) if key in given else each for key, each in old.parameters.items()}
-        own[k] = dataclasses.replace(old, parameters=parameters, weight=float(given.get("weight", old.weight)))
-        agents[i] = dataclasses.replace(agents[i], constraints=own)
-    return _like(team, agents)
 
 
 @jax.jit

@@ -59,7 +59,7 @@ class Fleet:
 
     def __enter__(self) -> Self:
         for agent, part in self.parts.items():
-            self.file(agent).write_text(write_part(part), encoding="utf-8")
+            self.write(agent, part)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -75,6 +75,10 @@ class Fleet:
     def file(self, agent: str, ending: str = "yaml") -> Path:
         """The private file of an agent, or another of its own, in a folder that only this user can read."""
         return Path(self._folder.name) / f"{spelled(agent)}.{ending}"
+
+    def write(self, agent: str, part: Part) -> None:
+        """Write the private file of an agent; what it reads when it starts, or is told to read it again."""
+        self.file(agent).write_text(write_part(part), encoding="utf-8")
 
     def start(self, agent: str, *options: str) -> None:
         """Start an agent, or start it again; `options` of its own come after the common ones."""
@@ -108,6 +112,8 @@ class Fleet:
 
     def tell(self, agent: str, order: Mapping[str, Any]) -> None:
         """Write a line on its stdin; nothing if it is gone."""
+        if agent not in self._children:
+            return
         stdin = self._children[agent].process.stdin
         assert stdin is not None
         try:

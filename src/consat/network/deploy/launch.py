@@ -13,6 +13,7 @@ import numpy as np
 
 from consat.engine.rounds import HOLD, SETTLED
 from consat.errors import NetworkError
+from consat.network.deploy.commands import Script, Stage, Timed, load_commands, no_commands
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
 from consat.network.deploy.observer import Observer
@@ -20,15 +21,18 @@ from consat.network.node.modes import DEFAULT_MODE, RATE, Manner, Mode, protocol
 from consat.network.node.part import Part, split
 from consat.network.node.problem import Alone
 from consat.numerics import float64
+from consat.problem.changes import changed, changes_of
 from consat.problem.objective import Schedule
 from consat.problem.team import Team
 from consat.problem.units import automatic, scale
 from consat.protocols import ROUNDS
 from consat.results.result import Result
 from consat.results.trace import Ending
+from consat.runs.options import RATE as ROUNDS_A_SECOND
+from consat.runs.options import WATCHED
 from consat.runs.preparation import copies_of, default_protocol
 from consat.runs.summary import summarise
-from consat.scenario import Scenario
+from consat.scenario import Scenario, dump
 from consat.settings import Settings
 
 PATIENCE: Final = 600.0
@@ -59,6 +63,7 @@ class Plan:
         stop: when to end earlier; unless `rounds` or `until` say when, once all agents know all that there is to find (interior-point), or
             after convergence.
         keys: folder of the team's keys, see ``consat keys``; None for links without protection.
+        commands: a file of timed changes, see `consat.network.deploy.commands`.
     """
 
     mode: Mode = DEFAULT_MODE
@@ -71,6 +76,7 @@ class Plan:
     until: float | None = None
     stop: Stop | None = None
     keys: Path | None = None
+    commands: Path | None = None
 
     def __post_init__(self) -> None:
         Manner(self.mode, self.rate, self.pace)  # what no agent could run is refused here, once
@@ -105,29 +111,35 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     Raises:
         InvalidTeam: a cluster is not connected by links, or a constraint is a Python function, which no other process can be given.
         InvalidSettings: the mode does not run the scenario's protocol.
+        InvalidScenario: a command cannot be carried out; nothing has started.
         NetworkError: an agent's process failed.
     """
     team = scenario.team
     settings = _settings(team, scenario.settings, plan.mode)
     scenario = replace(scenario, settings=settings)
+    script = no_commands(team) if plan.commands is None else load_commands(plan.commands, team, plan.mode, plan.until)
     ports = free_ports(team.count)
     addresses = {agent: f"tcp/127.0.0.1:{port}" for agent, port in zip(team.ids, ports, strict=True)}
-    parts = split(scenario, run=f"launch-{uuid.uuid4().hex[:12]}", addresses=addresses)
+    absent = frozenset(team.ids) - script.begin.present
+    parts = split(scenario, run=f"launch-{uuid.uuid4().hex[:12]}", addresses=addresses, absent=absent)
     size = scale(team)
     starts = np.array([part.first[part.team.ids.index(agent)] for agent, part in parts.items()])
     observer = Observer(team, starts, "round" if plan.mode == "lockstep" else "time")
     began = time.monotonic()
     with Fleet(parts, plan.options(), exact=plan.mode == "lockstep") as fleet:
+        crew = Crew(fleet, observer, plan, scenario, script, parts)
         for agent in team.ids:
-            _start(fleet, observer, plan, agent, settings.start.seed)
-        ending = _watch(
-            fleet, observer, plan, _rules(parts, plan, size.length), _Watch(f"{scenario.name}, {plan.mode}", quiet, settings.start.seed)
-        )
-        up = _up(observer, began)
+            crew.start(agent)
+        ending = _watch(crew, _rules(parts, plan, size.length), f"{scenario.name}, {plan.mode}", quiet)
+        up = crew.ready or time.monotonic()
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds)
+    team = crew.stage.there()[0]
+    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
+    if crew.done:  # what it was before is in the margins of the trace; verdicts over time are of a team that is not changed
+        team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
+        scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full) | {"mode": plan.mode, "network": observer.network()}
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
@@ -157,72 +169,183 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
     return _Rules(window + ROUND_TRIPS * plan.delay[1], SETTLED * length, -np.inf)
 
 
-@dataclass(frozen=True)
-class _Watch:
-    """How a team is watched: title of the table, whether there is none, and the seed of agents that start anew."""
+class Crew:
+    """The agents of a launch: started, started again when they crash, told the time and what changes.
 
-    title: str
-    quiet: bool
-    seed: int
+    Args:
+        fleet: their processes.
+        observer: what they tell.
+        plan: how they are launched.
+        scenario: of the team.
+        script: what changes.
+        parts: as they start.
+
+    Attributes:
+        stages: how the team stood, one after the other, and since when.
+        epoch: when t = 0 was, s of Unix time; None before all are ready.
+        ready: the same by the monotonic clock of this machine.
+    """
+
+    def __init__(
+        self, fleet: Fleet, observer: Observer, plan: Plan, scenario: Scenario, script: Script, parts: Mapping[str, Part]
+    ) -> None:  # fmt: skip
+        self.fleet, self.observer, self.plan = fleet, observer, plan
+        self.stages = [script.begin]
+        self.epoch: float | None = None
+        self.ready: float | None = None
+        self._scenario, self._script, self._parts = scenario, script, dict(parts)
+        self._standby = set(parts) - script.begin.present
+        self._generation = 0
+        observer.present = script.begin.present
+
+    @property
+    def stage(self) -> Stage:
+        """How the team stands now."""
+        return self.stages[-1]
+
+    @property
+    def done(self) -> int:
+        """How many commands have been carried out."""
+        return len(self.stages) - 1
+
+    @property
+    def timed(self) -> bool:
+        """Whether anything happens by the clock."""
+        return bool(self._script.commands) or self.stage.team.moves
+
+    @property
+    def tick(self) -> float:
+        """Of a round, s; one where nothing goes by time."""
+        return 1.0 / (self.plan.rate or ROUNDS_A_SECOND) if self.timed else 1.0
+
+    @staticmethod
+    def _stamp(unix: float) -> float:
+        """The stamp, by the monotonic clock of this machine, of a Unix time."""
+        return unix - time.time() + time.monotonic()
+
+    @property
+    def earliest(self) -> float:
+        """The first stamp at which the team may be done: when nothing is to happen any more; ∞ while that is not known."""
+        if not self.timed:
+            return -np.inf
+        if self.done < len(self._script.commands):
+            return np.inf
+        team = self.stage.team
+        moving = float(team.knots.max(initial=0.0)) if len(team.knots) or not team.moves else WATCHED
+        last = max([moving, *(each.at for each in self._script.commands)])
+        if self.plan.mode == "lockstep":
+            return last / self.tick
+        return np.inf if self.epoch is None else self._stamp(self.epoch) + last
+
+    def start(self, agent: str) -> None:
+        """Start an agent, or start it again where its body was last seen; in lockstep from what it has on disk."""
+        ids, seed = list(self.observer.team.ids), self._scenario.settings.start.seed
+        own = ["--seed", str(seed * len(ids) + ids.index(agent))]
+        if self.observer.seen[agent].places:
+            own += ["--position", ",".join(map(repr, self.observer.seen[agent].places[-1]))]
+        if self.plan.mode == "lockstep":
+            own += ["--memory", str(self.fleet.file(agent, "state"))]
+        if self.epoch is not None:
+            own += ["--epoch", repr(self.epoch)]
+        if agent in self._standby:
+            own += ["--standby"]
+        self.fleet.start(agent, *own)
+
+    def mend(self) -> None:
+        """Start those again that a signal has ended. Raises: NetworkError: one has failed by itself, and would again."""
+        for agent in self.observer.team.ids:
+            code = self.fleet.exit_code(agent) or 0
+            if code > 0:
+                raise NetworkError(f"the process of agent {agent!r} ended with exit code {code}")
+            if code < 0:
+                self.start(agent)
+
+    def act(self) -> None:
+        """Tell the agents the time once all are ready, and then what changes, when it is due."""
+        if self.epoch is None:
+            if not all(seen.born is not None for seen in self.observer.seen.values()):
+                return
+            self.epoch, self.ready = time.time(), time.monotonic()
+            if self.timed and self.plan.mode != "lockstep":
+                self.observer.origin = self.ready
+            for agent in self.observer.team.ids if self.timed else ():
+                self.fleet.tell(agent, {"command": "clock", "epoch": self.epoch})
+        commands, epoch = self._script.commands, self.epoch
+        while self.done < len(commands) and time.time() - epoch >= commands[self.done].at and self._carry_out(commands[self.done]):
+            self.stages.append(commands[self.done].after._replace(since=time.time() - epoch))
+            self.observer.present = self.stage.present
+
+    def _carry_out(self, command: Timed) -> bool:
+        """Whether it is done; not before one who is to join is ready to."""
+        agent = command.agents[0]
+        if command.command == "change":
+            part = self._parts[agent]
+            team = changed(part.team, changes_of(part.team, agent, command.constraint, command.parameters))
+            self._parts[agent] = replace(part, team=team)
+            self.fleet.write(agent, self._parts[agent])  # for when it crashes
+            self.fleet.tell(agent, {"command": "change", "constraint": command.constraint, **command.parameters})
+            return True
+        if command.command == "join" and not self._is_ready(agent):
+            return False
+        self._split_anew(command.after.there()[0])
+        if command.command in ("leave", "join"):
+            self._standby -= {agent}
+            self.fleet.tell(agent, {"command": command.command})
+        return True
+
+    def _is_ready(self, agent: str) -> bool:
+        """Whether one who is to join stands by; it is started if it does not run."""
+        if agent not in self._standby and not self.fleet.running(agent):  # it has left before
+            self._standby.add(agent)
+            self.observer.seen[agent].born = None
+            self.start(agent)
+        return agent in self._standby and self.observer.seen[agent].born is not None
+
+    def _split_anew(self, team: Team) -> None:
+        """New parts for those who are there: who holds what, and along which links it travels, may be other than before."""
+        self._generation += 1
+        addresses = {agent: self._parts[agent].listen for agent in team.ids}
+        run = next(iter(self._parts.values())).run
+        scenario = replace(self._scenario, team=team)
+        self._parts |= split(scenario, run=run, addresses=addresses, epoch=self.epoch, generation=self._generation)
+        for agent in team.ids:
+            self.fleet.write(agent, self._parts[agent])
+            self.fleet.tell(agent, {"command": "reload"})
 
 
-def _start(fleet: Fleet, observer: Observer, plan: Plan, agent: str, seed: int) -> None:
-    """Start an agent, or start it again where its body was last seen; in lockstep from what it has on disk."""
-    ids = list(observer.team.ids)
-    own = ["--seed", str(seed * len(ids) + ids.index(agent))]
-    if observer.seen[agent].places:
-        own += ["--position", ",".join(map(repr, observer.seen[agent].places[-1]))]
-    if plan.mode == "lockstep":
-        own += ["--memory", str(fleet.file(agent, "state"))]
-    fleet.start(agent, *own)
-
-
-def _mend(fleet: Fleet, observer: Observer, plan: Plan, seed: int) -> None:
-    """Start those again that a signal has ended. Raises: NetworkError: one has failed by itself, and would again."""
-    for agent in observer.team.ids:
-        code = fleet.exit_code(agent) or 0
-        if code > 0:
-            raise NetworkError(f"the process of agent {agent!r} ended with exit code {code}")
-        if code < 0:
-            _start(fleet, observer, plan, agent, seed)
-
-
-def _watch(fleet: Fleet, observer: Observer, plan: Plan, rules: _Rules, watch: _Watch) -> Ending:
+def _watch(crew: Crew, rules: _Rules, title: str, quiet: bool) -> Ending:
     """Until the team is to be stopped; why. `Plan.until` counts from when all agents have begun. Who crashes is started again."""
-    began = time.monotonic()
+    began, plan, observer = time.monotonic(), crew.plan, crew.observer
     end = None if plan.until is not None else began + PATIENCE
     agents = observer.team.ids
     try:
-        with board(watch.title, quiet=watch.quiet) as draw:
+        with board(title, quiet=quiet) as draw:
             while end is None or time.monotonic() < end:
-                observer.take(fleet.poll(0.05))
-                draw(observer, {agent: fleet.running(agent) for agent in agents}, time.monotonic() - began)
-                _mend(fleet, observer, plan, watch.seed)
+                observer.take(crew.fleet.poll(0.05))
+                draw(observer, {agent: crew.fleet.running(agent) for agent in agents}, time.monotonic() - began)
+                crew.mend()
+                crew.act()
                 if not np.isfinite(observer.positions()).all():
                     return "diverged"
-                if plan.rounds is not None and all(seen.finished or seen.ended for seen in observer.seen.values()):
+                if plan.rounds is not None and all(seen.finished or seen.ended for seen in observer.there):
                     return "out of time"
-                if not all(seen.stamps for seen in observer.seen.values()):
+                if not all(seen.stamps for seen in observer.there):
                     continue
                 if end is None:
                     end = time.monotonic() + (plan.until or 0.0)
-                if (found := _ending(observer, plan.ending, rules)) is not None:
+                if (found := _ending(observer, plan.ending, rules, crew.earliest)) is not None:
                     return found
     except KeyboardInterrupt:
         return "interrupted"
     return "out of time"
 
 
-def _up(observer: Observer, began: float) -> float:
-    """When the last agent had begun, by the clock of this machine."""
-    return max([began, *(seen.born for seen in observer.seen.values() if seen.born is not None)])
-
-
-def _ending(observer: Observer, stop: Stop, rules: _Rules) -> Ending | None:
-    latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in observer.seen.values())
+def _ending(observer: Observer, stop: Stop, rules: _Rules, earliest: float) -> Ending | None:
+    latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in observer.there)
     known, since = observer.all_known()[0], observer.concluded()
+    since = None if since is None else max(since, earliest)
     if stop != "never" and (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
         return "satisfied" if known == "satisfied" else "settled"
-    if stop != "never" and latest >= rules.earliest and observer.settled(rules.window, rules.distance):
+    if stop != "never" and latest >= max(rules.earliest, earliest) and observer.settled(rules.window, rules.distance):
         return "settled"
     return None

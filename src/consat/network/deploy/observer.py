@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from consat.engine.live import Live
 from consat.engine.violations import shares_of
+from consat.network.deploy.commands import Stage
 from consat.network.deploy.fleet import Event
 from consat.network.node.station import Knowledge
 from consat.problem.objective import Nu, Objective
@@ -54,6 +56,8 @@ class Seen:
     def take(self, event: Event) -> None:
         """Learn from an event."""
         match event["event"]:
+            case "standby":
+                self.born = event["t"]
             case "start":
                 self._before, self._sent, self.ended = self._before + self._sent, Counter(), None
                 self._learn(None, None, settled=False)
@@ -103,10 +107,15 @@ class Observer:
         team: as everybody together knows it.
         start: (N, d) where the bodies begin.
         clock: what stamps count.
+
+    Attributes:
+        present: who is there now.
+        origin: the stamp at t = 0; None where nothing goes by it: then time is counted from the first stamp.
     """
 
     def __init__(self, team: Team, start: np.ndarray, clock: str) -> None:
-        self.team, self.clock = team, clock
+        self.team, self.clock, self.present = team, clock, frozenset(team.ids)
+        self.origin: float | None = None
         self.seen = {agent: Seen() for agent in team.ids}
         self._start = start
 
@@ -116,25 +125,30 @@ class Observer:
             if event.get("id") in self.seen:
                 self.seen[event["id"]].take(event)
 
+    @property
+    def there(self) -> list[Seen]:
+        """Of those who are there."""
+        return [seen for agent, seen in self.seen.items() if agent in self.present]
+
     def all_known(self) -> tuple[Knowledge, float | None]:
         """What all agents know, and since which stamp. Where some know that all that they can hear of are satisfied, and others that the
         team cannot be, it is infeasible."""
-        known = [seen.known for seen in self.seen.values()]
+        known = [seen.known for seen in self.there]
         if None in known:
             return None, None
-        return "infeasible" if "infeasible" in known else "satisfied", max(seen.known_from or 0.0 for seen in self.seen.values())
+        return "infeasible" if "infeasible" in known else "satisfied", max(seen.known_from or 0.0 for seen in self.there)
 
     def concluded(self) -> float | None:
         """Since which stamp all know all that there is to find, or None."""
-        since = [seen.settled_from for seen in self.seen.values()]
+        since = [seen.settled_from for seen in self.there]
         return None if None in since else max(stamp for stamp in since if stamp is not None)
 
     def settled(self, window: float, distance: float) -> bool:
         """Whether nobody has moved by more than `distance` over the last `window` of stamps, and all are up and heard."""
-        if any(seen.report is None or not all(peer["up"] for peer in seen.report["peers"].values()) for seen in self.seen.values()):
+        if any(seen.report is None or not all(peer["up"] for peer in seen.report["peers"].values()) for seen in self.there):
             return False
-        latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in self.seen.values())
-        return all(seen.moved(latest - window) <= distance for seen in self.seen.values())
+        latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in self.there)
+        return all(seen.moved(latest - window) <= distance for seen in self.there)
 
     def positions(self) -> np.ndarray:
         """(N, d) where the bodies are."""
@@ -157,40 +171,57 @@ class Observer:
             "agents": agents,
         }
 
-    def trace(self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float]) -> Trace:
-        """All of it as a trace. Positions between two stamps are those at the earlier one."""
+    def trace(
+        self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], tick: float
+    ) -> Trace:  # fmt: skip
+        """All of it as a trace, of the agents that are there at the end. Positions between two stamps are those at the earlier one.
+
+        Args:
+            copies: who holds what at the end.
+            nu: the smoothing.
+            ending: why the run ended.
+            seconds: spent.
+            stages: how the team stood, one after the other.
+            tick: of a round, s.
+        """
         begin = self._begin()
-        end = max((seen.stamps[-1] for seen in self.seen.values() if seen.stamps), default=0.0)
+        end = max([begin, *(seen.stamps[-1] for seen in self.seen.values() if seen.stamps)])
         if self.clock == "round":
             stamps = steps = np.arange(int(end) + 1, dtype=float)
         else:
             stamps = np.append(np.arange(begin, end, SAMPLE), end)
             steps = stamps - begin
         position = np.stack([self._along(seen, row, stamps) for seen, row in zip(self.seen.values(), self._start, strict=True)], axis=1)
-        dt = 1.0 if self.clock == "round" else SAMPLE
-        margins, smooth = map(np.asarray, _look(Objective.at_positions(self.team), jnp.asarray(position), nu))
+        dt = tick if self.clock == "round" else SAMPLE
+        times = steps * (tick if self.clock == "round" else 1.0)
+        margins, smooth = _seen(stages, position, times, nu)
+        final, there = stages[-1].there()
         sent = sum((seen.sent for seen in self.seen.values()), Counter[str]())
+        still = len(stages) == 1 and not final.moves
+        margin, position = margins.min(axis=1), position[:, there]
         return Trace(
             clock="round" if self.clock == "round" else "time",
             steps=steps if self.clock == "time" else steps.astype(int),
             position=position,
             velocity=np.diff(position, axis=0, append=position[-1:]) / dt,
-            margin=margins.min(axis=1),
+            margin=margin,
             smooth_margin=smooth,
-            agent_margin=margins,
+            agent_margin=margins[:, there],
             estimate=None,
             integral=None,
             holder=copies.holder,
             held=copies.position,
             cluster=copies.cluster,
             ending=ending,
-            satisfied_from=satisfied_from(steps, margins.min(axis=1), interpolate=False),
+            satisfied_from=satisfied_from(steps, margin, interpolate=False),
             messages=sent["messages"],
             floats_sent=sent["floats"],
             known=self.all_known()[0],
             known_from=self._known_from(),
             seconds=seconds,
-            violated=shares_of(self.team, position),
+            period=tick if self.clock == "round" and final.moves else None,
+            violated=shares_of(final, position) if still else None,
+            motion=None if still else _motion(times, margin),
         )
 
     def _known_from(self) -> float | None:
@@ -201,7 +232,9 @@ class Observer:
         return int(since) if self.clock == "round" else since - self._begin()
 
     def _begin(self) -> float:
-        """The first stamp."""
+        """The stamp from which time is counted."""
+        if self.origin is not None:
+            return self.origin
         return min((seen.stamps[0] for seen in self.seen.values() if seen.stamps), default=0.0)
 
     def _along(self, seen: Seen, start: np.ndarray, stamps: np.ndarray) -> np.ndarray:
@@ -211,7 +244,37 @@ class Observer:
         return places[np.searchsorted(known, stamps, side="right")]
 
 
+def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: Nu) -> tuple[np.ndarray, np.ndarray]:
+    """(T, N) ᾱ_i, +∞ of those who are not there, and (T,) β, by the constraints as they were at each of the times, (T,), s."""
+    margins, smooth = np.full(position.shape[:2], np.inf), np.zeros(len(times))
+    which = np.searchsorted([stage.since for stage in stages], times, side="right") - 1
+    for k in np.unique(which):
+        rows = which == k
+        team, there = stages[k].there()
+        live = Live.of(team, 1.0, all_of_them=False)
+        found = _look(Objective.at_positions(team), live, jnp.asarray(position[:, there]), jnp.asarray(times), nu)
+        margins[np.ix_(rows, there)], smooth[rows] = (np.asarray(each)[rows] for each in found)
+    return margins, smooth
+
+
 @jax.jit
-def _look(observer: Objective, position: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
+def _look(observer: Objective, live: Live | None, position: jax.Array, times: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
     """(T, N) ᾱ_i and (T,) β."""
-    return jax.vmap(observer.agent_margins)(position), jax.vmap(lambda x: observer.smooth_margin(x, nu))(position)
+
+    def at(x: jax.Array, time: jax.Array) -> tuple[jax.Array, jax.Array]:
+        here = observer if live is None else observer.with_parameters(live.at(time))
+        return here.agent_margins(x), here.smooth_margin(x, nu)
+
+    return jax.vmap(at)(position, times)
+
+
+def _motion(times: np.ndarray, margin: np.ndarray) -> dict[str, Any]:
+    """Of ``launch --json`` what is said of a team that moves or is changed, as of ``run``; both (T,)."""
+    good = margin > 0
+    first = int(np.argmax(good)) if good.any() else None
+    return {
+        "duration": float(times[-1] - times[0]),
+        "satisfied_share": float(good.mean()),
+        "satisfied_share_after": None if first is None else float(good[first:].mean()),
+        "worst_margin_after": None if first is None else float(margin[first:].min()),
+    }

@@ -4,6 +4,7 @@ what is due: exact, repeatable, and as fast as the agents compute.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -30,6 +31,7 @@ class Rehearsal:
         air: the network between them.
         speed: the most that a body moves, length/s.
         build: makes the runner of an agent; what a process would make if None.
+        skew: how far the Unix time of each agent is ahead of that of the network, s.
     """
 
     def __init__(
@@ -40,11 +42,13 @@ class Rehearsal:
         *,
         speed: float = np.inf,
         build: Callable[..., Runner] = runner_of,
+        skew: Mapping[str, float] | None = None,
     ) -> None:
         self.parts, self.manner, self.air = parts, manner, air
         self.events: list[dict[str, Any]] = []
         self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
+        self._skew = skew or {}
         self._build, self._incarnations = build, dict.fromkeys(parts, 0)
         self._due: dict[str, float] = {}
 
@@ -63,8 +67,12 @@ class Rehearsal:
                 self.runners[agent] = self._build(
                     part, manner, self.air.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
                     clock=self.air.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
+                    wall=functools.partial(self._wall, self._skew.get(agent, 0.0)),
                 )  # fmt: skip
             self._due[agent] = self.air.now + OPENING
+
+    def _wall(self, skew: float) -> float:
+        return self.air.now + skew
 
     def kill(self, *agents: str) -> None:
         """As a crash does: without a word."""

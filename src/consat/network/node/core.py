@@ -6,10 +6,12 @@ for each neighbour. `Embodied` adds to any core the agreement about bodies.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from dataclasses import replace
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.node.part import Part
-from consat.network.node.problem import Alone, ends
+from consat.network.node.problem import Alone, ends, live_of
 from consat.network.wire import Numbers
 from consat.numerics import quick_compilation
 from consat.protocols import Known, Rounds, agreement
@@ -41,6 +43,7 @@ class Moment(NamedTuple):
         fresh: (E,) whether the neighbour at the other end was heard lately.
         body: (d,) where the agent's body is, NaN where that is not known.
         margin: ᾱ_i there, and where it last heard that the others are; −∞ where that is not known.
+        time: by the clock that the team shares, s since t = 0; what schedules go by.
     """
 
     round: float
@@ -49,6 +52,7 @@ class Moment(NamedTuple):
     fresh: np.ndarray
     body: np.ndarray
     margin: float = -np.inf
+    time: float = 0.0
 
 
 class Look(NamedTuple):
@@ -136,21 +140,36 @@ class Core(Protocol):
         """Of the part."""
         ...
 
-    def begin(self, first: np.ndarray) -> Any:
-        """The state from first estimates, (rows, d)."""
+    def begin(self, first: np.ndarray, time: float = 0.0) -> Any:
+        """The state from first estimates, (rows, d), at a time of the shared clock, s."""
         ...
 
     def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         """Hear what arrived, where `arrived`, (E,) and (G,), and take a step."""
         ...
 
-    def among(self, gone: Collection[str]) -> Core:
-        """The same protocol when these agents are not there."""
+    def among(self, gone: Collection[str], whole: Part | None = None) -> Core:
+        """The same protocol when these agents are not there, on another part if one is given."""
         ...
 
-    def carry(self, other: Core, state: Any, first: np.ndarray) -> Any:
+    def carry(self, other: Core, state: Any, first: np.ndarray, time: float = 0.0) -> Any:
         """The state that `state` of an `other` core becomes in this one; what is new begins from `first`, (rows, d)."""
         ...
+
+    def anew(self, state: Any) -> Any:
+        """The state when constraints have changed: what was proven with others holds no more."""
+        ...
+
+
+_Any = TypeVar("_Any", bound=Any)
+
+
+def adjusted(core: _Any, whole: Part) -> _Any:
+    """A core with other parameters of its constraints: those of a part that differs in nothing else. Nothing compiles."""
+    other = copy.copy(core)
+    other.whole, other.part = whole, whole.without(set(core.whole.team.ids) - set(core.part.team.ids))
+    other.solver = replace(core.solver, live=live_of(other.part))
+    return other
 
 
 class Kept(NamedTuple):
@@ -210,20 +229,24 @@ class RoundCore:
         self.largest = np.array([*(LARGEST if shape else single for shape, size in self._layout.each for _ in range(size)), LARGEST])
         self.letters = no_letters(whole)
 
-    def begin(self, first: np.ndarray) -> _Now:
-        return self._begin(self.protocol, self.solver, first)
+    def begin(self, first: np.ndarray, time: float = 0.0) -> _Now:
+        return self._begin(self.protocol, self.solver, first, time)
 
     def turn(self, state: _Now, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         heard = inbox.link, arrived.link, moment.fresh
-        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, heard, (moment.round, moment.margin))
+        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, heard, (moment.round, moment.margin, moment.time))
         return Turned(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
 
-    def among(self, gone: Collection[str]) -> RoundCore:
-        return RoundCore(self.protocol, self.whole, gone)
+    def among(self, gone: Collection[str], whole: Part | None = None) -> RoundCore:
+        return RoundCore(self.protocol, whole or self.whole, gone)
 
-    def carry(self, other: Core, state: _Now, first: np.ndarray) -> _Now:
+    def anew(self, state: _Now) -> _Now:
+        """Nothing is proven in it; that constraints hold is counted afresh in every turn."""
+        return state
+
+    def carry(self, other: Core, state: _Now, first: np.ndarray, time: float = 0.0) -> _Now:
         """Only the estimates live on: the rest has settled on a problem that is no more, what is known of its satisfaction included."""
-        return self.begin(np.asarray(Kept.of(self, other).merge("row", state.state.x, first)))
+        return self.begin(np.asarray(Kept.of(self, other).merge("row", state.state.x, first)), time)
 
 
 class _Outline:
@@ -282,15 +305,17 @@ class _Layout(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def _begin(protocol: Rounds, solver: Alone, first: Array) -> _Now:
+def _begin(protocol: Rounds, solver: Alone, first: Array, time: Array) -> _Now:
+    solver = solver.at(time)
     return _Now(protocol.start(first, solver), agreement.start(first, solver))
 
 
 def _turn(
-    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], moment: tuple[Array, Array]
+    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], moment: tuple[Array, Array, Array]
 ) -> tuple[_Now, Array]:
     inbox, arrived, fresh = heard
-    round_, margin = moment
+    round_, margin, time = moment
+    solver = solver.at(time)
     state = protocol.hear(now.state, layout.unpack(inbox), arrived, solver)
     ages = known_of(agreement.hear(now.ages, inbox[:, -1], arrived), fresh)
     known = Known(agreement.known(ages, solver), jnp.asarray(margin)[None])
@@ -339,15 +364,15 @@ class Embodied:
         self.letters = core.letters
         self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
 
-    def begin(self, first: np.ndarray) -> EmbodiedState:
-        """The state from first estimates, (rows, d)."""
-        return EmbodiedState(self.core.begin(first), self._start(self.core.solver, first))
+    def begin(self, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
+        """The state from first estimates, (rows, d), at a time of the shared clock, s."""
+        return EmbodiedState(self.core.begin(first, time), self._start(self.core.solver, first))
 
     def turn(self, state: EmbodiedState, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[EmbodiedState, Rows, Look]:
         """See `Core.turn`; and what the agent then sees of itself."""
         width = self.core.width
         bodies, said, sight = self._agree(
-            self.core.solver, self._owners, state.bodies, (inbox.link[:, width:], arrived.link, moment.fresh), moment.body
+            self.core.solver, self._owners, state.bodies, (inbox.link[:, width:], arrived.link, moment.fresh), moment.body, moment.time
         )
         heard, known, margin = (np.asarray(each)[0] for each in sight)
         moment = moment._replace(margin=float(margin))
@@ -364,19 +389,27 @@ class Embodied:
         inbox = Rows(np.zeros((len(self.ends), self.width)), np.zeros((len(neighbours), longest)))
         return inbox, Rows(*(np.zeros(len(rows), dtype=bool) for rows in inbox))
 
-    def margin(self, positions: np.ndarray) -> float:
-        """ᾱ_i, were the agents of the part at these positions, (rows, d); +∞ without constraints."""
-        return float(np.asarray(self._margin(self.core.solver, positions))[0])
+    def margin(self, positions: np.ndarray, time: float = 0.0) -> float:
+        """ᾱ_i at a time of the shared clock, s, were the agents of the part at these positions, (rows, d); +∞ without constraints."""
+        return float(np.asarray(self._margin(self.core.solver, positions, time))[0])
 
-    def among(self, gone: Collection[str]) -> Embodied:
-        """The same when these agents are not there."""
-        return Embodied(self.core.among(gone))
+    def among(self, gone: Collection[str], whole: Part | None = None) -> Embodied:
+        """The same when these agents are not there, on another part if one is given."""
+        return Embodied(self.core.among(gone, whole))
 
-    def carry(self, other: Embodied, state: EmbodiedState, first: np.ndarray) -> EmbodiedState:
+    def adjusted(self, whole: Part) -> Embodied:
+        """See `adjusted`."""
+        return Embodied(adjusted(self.core, whole))
+
+    def anew(self, state: EmbodiedState) -> EmbodiedState:
+        """See `Core.anew`."""
+        return state._replace(core=self.core.anew(state.core))
+
+    def carry(self, other: Embodied, state: EmbodiedState, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
         """See `Core.carry`. Where bodies are lives on; who is satisfied does not."""
         fresh = self._start(self.core.solver, first)
         bodies = Kept.of(self, other).merge(_PER_BODIES, state.bodies, fresh)._replace(ages=fresh.ages)
-        return EmbodiedState(self.core.carry(other.core, state.core, first), bodies)
+        return EmbodiedState(self.core.carry(other.core, state.core, first, time), bodies)
 
 
 def owners_of(part: Part) -> agreement.Owners:
@@ -388,8 +421,10 @@ def owners_of(part: Part) -> agreement.Owners:
 
 
 def _agree(
-    solver: Alone, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array
-) -> tuple[agreement.Bodies, Array, tuple[Array, Array, Array]]:
+    solver: Alone, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array,
+    time: Array,
+) -> tuple[agreement.Bodies, Array, tuple[Array, Array, Array]]:  # fmt: skip
+    solver = solver.at(time)
     inbox, arrived, fresh = heard
     bodies = agreement.hear_bodies(bodies, agreement.Word(inbox[:, :-2], inbox[:, -2], inbox[:, -1]), arrived, owners, solver)
     bodies, word = agreement.speak_bodies(bodies._replace(ages=known_of(bodies.ages, fresh)), body[None], owners, solver)
@@ -415,8 +450,8 @@ def _compiled() -> _Programs:
     def start(solver: Alone, first: Array) -> agreement.Bodies:
         return agreement.start_bodies(first, solver)
 
-    def margin(solver: Alone, positions: Array) -> Array:
-        return solver.margin(positions)
+    def margin(solver: Alone, positions: Array, time: Array) -> Array:
+        return solver.at(time).margin(positions)
 
     return _Programs(
         jax.jit(_begin, static_argnames=("protocol",), compiler_options=options),

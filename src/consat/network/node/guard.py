@@ -51,7 +51,7 @@ def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment)
     rest = Turn(*core.turn(state, *_only(core, inbox, arrived, kept), moment), refused=tuple(refused))
     if _sound(state, rest):
         return rest
-    fresh = core.begin(core.part.first)
+    fresh = core.begin(core.part.first, moment.time)
     return Turn(*core.turn(fresh, *_only(core, inbox, arrived, set()), moment), refused=tuple(refused), anew=True)
 
 

@@ -84,23 +84,28 @@ class LinkCore:
         self.letters = no_letters(whole)
         self._begin, self._turn = _compiled()
 
-    def begin(self, first: np.ndarray) -> LinkState:
-        return self._begin(self.solver, first)
+    def begin(self, first: np.ndarray, time: float = 0.0) -> LinkState:
+        return self._begin(self.solver, first, time)
 
     def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
         state, outbox = self._turn(self.solver, gains, state, inbox.link, arrived.link, moment)
         return Turned(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
 
-    def among(self, gone: Collection[str]) -> LinkCore:
-        return LinkCore(self.whole, self.k1, self.k2, gone)
+    def among(self, gone: Collection[str], whole: Part | None = None) -> LinkCore:
+        return LinkCore(whole or self.whole, self.k1, self.k2, gone)
 
-    def carry(self, other: Core, state: LinkState, first: np.ndarray) -> LinkState:
+    def anew(self, state: LinkState) -> LinkState:
+        """Nothing is proven in it."""
+        return state
+
+    def carry(self, other: Core, state: LinkState, first: np.ndarray, time: float = 0.0) -> LinkState:
         """All that belongs to ends that live on does."""
-        return Kept.of(self, other).merge(_PER, state, self.begin(first))
+        return Kept.of(self, other).merge(_PER, state, self.begin(first, time))
 
 
-def _begin(solver: Alone, first: Array) -> LinkState:
+def _begin(solver: Alone, first: Array, time: Array) -> LinkState:
+    solver = solver.at(time)
     there = solver.links.at(first)
     nothing = jnp.zeros(len(there))
     kappa = jnp.ones(len(first))
@@ -113,6 +118,7 @@ def _begin(solver: Alone, first: Array) -> LinkState:
 def _turn(
     solver: Alone, gains: tuple[Array, Array], state: LinkState, inbox: Array, arrived: Array, moment: Moment
 ) -> tuple[LinkState, Array]:
+    solver = solver.at(moment.time)
     state = _hear(solver, state, inbox, arrived)
     k1, k2 = gains
     links = solver.links

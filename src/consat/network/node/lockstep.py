@@ -8,18 +8,20 @@ memory starts anew in the round of the slowest neighbour, which a protocol that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import jax
 import numpy as np
 
+from consat.errors import InvalidSettings
 from consat.network.node.core import Moment, Rows
 from consat.network.node.paced import FAREWELLS
 from consat.network.node.persistence import Store
 from consat.network.node.station import SILENT, Station
 from consat.network.wire import SUPPORT, Kind
+from consat.runs.options import RATE as ROUNDS_A_SECOND
 
 RESEND: Final = 0.006
 """Whoever waits repeats itself after so long, s, or after `USUAL` times as long as rounds take at best; then after twice as long …"""
@@ -34,7 +36,7 @@ class Lockstep:
     Args:
         station: its own.
         turns: how many rounds; None for no end. After the last it goes on to answer whoever lacks it.
-        rate: at most so many rounds a second, Hz; as many as there can be if None.
+        rate: at most so many rounds a second, Hz; as many as there can be if None. Schedules go by rounds: round r is at r/rate.
         memory: a file in which to keep the state; none if None.
     """
 
@@ -42,6 +44,7 @@ class Lockstep:
         self.station = station
         self.done = False
         self._turns, self._period = turns, 0.0 if rate is None else 1.0 / rate
+        self._tick = 1.0 / (rate or ROUNDS_A_SECOND)  # time is counted in rounds, as in one process
         self._round = 0  # so many are spoken
         self._regrouped = 0  # so many were, when somebody last came or went: a protocol begins anew then
         self._said: dict[str, list[np.ndarray]] = {}
@@ -62,6 +65,10 @@ class Lockstep:
         """Leave for good: say so for a while, then be done."""
         self.station.membership.drop(self.station.part.me)
         self._farewells = FAREWELLS
+
+    def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
+        """Raises: InvalidSettings: rounds go as in one process, whose constraints are those of the scenario."""
+        raise InvalidSettings("mode lockstep goes as consat run does, whose constraints stay; run another mode to change them")
 
     def step(self) -> float:
         """Do what is due; when to be called again at the latest."""
@@ -159,7 +166,8 @@ class Lockstep:
     def _moment(self, number: int) -> Moment:
         """Of a round, in which everybody was heard, however long it took."""
         count = len(self.station.core.ends)
-        return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place())
+        time = (self._round + 1.0) * self._tick
+        return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
     def _speak(self, now: float) -> None:
         station = self.station

@@ -57,6 +57,11 @@ class Membership:
         """`agent` has left for good: the agent itself says so, or another that has waited long enough."""
         self._epoch[agent] += 1 - self._epoch[agent] % 2
 
+    def adopt(self, other: Membership) -> None:
+        """Take over what another one of the same agent knows, of those that both know."""
+        for agent in self._epoch.keys() & other._epoch.keys():
+            self._epoch[agent] = max(self._epoch[agent], other._epoch[agent])
+
     def restore(self, agents: Iterable[str], epochs: np.ndarray) -> None:
         """As it was written down before a restart."""
         self._epoch.update(zip(agents, map(int, epochs), strict=True))

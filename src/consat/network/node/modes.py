@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, Protocol, get_args
+from typing import Any, Final, Literal, Protocol, get_args
 
 import numpy as np
 
@@ -80,6 +81,15 @@ class Runner(Protocol):
         """Do what is due; when to be called again at the latest. To be called as well when a message has come."""
         ...
 
+    def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
+        """Go on with other parameters of an own constraint.
+
+        Raises:
+            InvalidTeam: they cannot be; nothing has changed.
+            InvalidSettings: the mode does not allow it.
+        """
+        ...
+
     def leave(self) -> None:
         """Leave for good: the others go on without this agent's constraints."""
         ...
@@ -134,12 +144,13 @@ def runner_of(
     body: Body,
     log: Log,
     core: Embodied | None = None,
+    wall: Callable[[], float] = time.time,
 ) -> Runner:
-    """An agent ready to run; its first step will begin. `core` is what `core_of` gives, if that is at hand."""
+    """An agent ready to run; its first step will begin. `core` is what `core_of` gives, if that is at hand; wall: Unix time, s."""
     lockstep = manner.mode == "lockstep"
     station = Station(
         part, core or core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
-        frames=2 if lockstep else 1, stamped=lockstep, give_up=manner.give_up, report=manner.report,
+        frames=2 if lockstep else 1, stamped=lockstep, give_up=manner.give_up, report=manner.report, wall=wall,
     )  # fmt: skip
     if lockstep:
         return Lockstep(station, turns=manner.turns, rate=manner.rate, memory=manner.memory)

@@ -29,6 +29,7 @@ class Peer:
         said: when it was last spoken to.
         trip: round trip, running mean, s; NaN before it is known.
         lost: share of its messages that did not arrive (in order), running mean.
+        restarts: how often it has begun anew since it was first heard.
     """
 
     known: Neighbour
@@ -39,9 +40,12 @@ class Peer:
     said: float = -np.inf
     trip: float = np.nan
     lost: float = 0.0
+    restarts: int = 0
 
     def take(self, message: Message, now: float) -> None:
         """Learn from an accepted message."""
+        if self.last is not None and message.incarnation > self.last.incarnation:
+            self.restarts += 1
         if self.last is not None and self.last.incarnation == message.incarnation and message.sequence > self.last.sequence:
             gap = message.sequence - self.last.sequence
             self.lost += (1.0 - (1.0 - SMOOTH) ** gap) * ((gap - 1) / gap - self.lost)

@@ -1,4 +1,8 @@
-"""What an agent's process is told: orders and measurements, as lines on stdin, and signals."""
+"""What an agent's process is told: orders and measurements, as lines on stdin, and signals.
+
+An order is a JSON object with a ``command``, one of `KEYS`. Whether it has the keys that it must have is checked here, what it says of
+constraints where these are known.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +16,11 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from consat.errors import closest, shown
 from consat.network.node.body import Measurement
 from consat.network.node.core import LARGEST
 
@@ -25,6 +30,49 @@ SHOWN: Final = 80
 """Characters of a line that are reported."""
 HELD: Final = 256
 """Measurements, and lines to report, that are kept while the agent is busy: the newest."""
+
+
+KEYS: Final[dict[str, tuple[str, ...]]] = {
+    "stop": (), "leave": (), "join": (), "clock": ("epoch",), "reload": (), "change": ("constraint",),
+}  # fmt: skip
+"""The commands, and which keys each must have; a change has parameters besides, the others no more."""
+EXAMPLE: Final = '{"position": [...]}, {"command": "stop"}, {"command": "leave"} or {"command": "change", "constraint": ..., ...}'
+
+
+class Order(NamedTuple):
+    """A command that is well-formed.
+
+    Attributes:
+        command: see `KEYS`.
+        given: what comes with it.
+        line: as it was told, cut where it is long.
+    """
+
+    command: str
+    given: dict[str, Any]
+    line: str
+
+
+def order_of(told: Any, line: str) -> Order | str:
+    """The order that a JSON value is, or why it is none."""
+    command = told.get("command") if isinstance(told, dict) else None
+    if not isinstance(command, str):
+        return f"it must be {EXAMPLE}"
+    if command not in KEYS:
+        return f"there is no command {shown(command)}{closest(command, KEYS)}; the commands are {', '.join(KEYS)}"
+    given = {key: value for key, value in told.items() if key != "command"}
+    for key in KEYS[command]:
+        if key not in given:
+            return f"{command} lacks {key}"
+    if command != "change" and (unknown := [key for key in given if key not in KEYS[command]]):
+        return f"{command} has no key {shown(unknown[0])}"
+    if command == "change" and not isinstance(given["constraint"], str):
+        return f"the name of a constraint must be a text, but is {shown(given['constraint'])}"
+    if command == "change" and len(given) == 1:
+        return 'change names no parameter, such as "radius": 2'
+    if command == "clock" and not _is_coordinate(given["epoch"]):
+        return f"epoch is {shown(given['epoch'])}, but must be a Unix time, s"
+    return Order(command, given, line)
 
 
 class Orders:
@@ -41,6 +89,7 @@ class Orders:
         self._dimension = dimension
         self._measurements: deque[tuple[str, Measurement]] = deque(maxlen=HELD)
         self._rejected: deque[tuple[str, str]] = deque(maxlen=HELD)
+        self._others: deque[Order] = deque()
         if reading:
             threading.Thread(target=self._read, name="stdin", daemon=True).start()
 
@@ -48,6 +97,10 @@ class Orders:
         """The lines that are measurements, each once."""
         while self._measurements:
             yield self._measurements.popleft()
+
+    def next(self) -> Order | None:
+        """The next of the orders but to stop and to leave, each once; None where none waits."""
+        return self._others.popleft() if self._others else None
 
     def rejected(self) -> Iterator[tuple[str, str]]:
         """The lines that mean nothing, each once, and why."""
@@ -63,18 +116,22 @@ class Orders:
     def _take(self, line: str) -> str | None:
         """Heed a line; or why not."""
         try:
-            order = json.loads(line)
+            told = json.loads(line)
         except (ValueError, RecursionError):
             return "it is no JSON"
-        command = order.get("command") if isinstance(order, dict) else None
-        if command == "stop":
+        if isinstance(told, dict) and "position" in told and "command" not in told:
+            return self._measure(line, told["position"], told.get("stamp"))
+        order = order_of(told, line[:SHOWN])
+        if isinstance(order, str):
+            return order
+        if order.command == "stop":
             self.stopped = "told to stop"
-        elif command == "leave":
+        elif order.command == "leave":
             self.leaving = True
-        elif isinstance(order, dict) and "position" in order:
-            return self._measure(line, order["position"], order.get("stamp"))
+        elif len(self._others) < HELD:
+            self._others.append(order)
         else:
-            return 'it must be {"position": [...]}, {"command": "stop"} or {"command": "leave"}'
+            return f"{HELD} orders wait already; tell it again later"
         return None
 
     def _measure(self, line: str, position: Any, stamp: Any) -> str | None:

@@ -6,7 +6,7 @@ After a start or restart an agent stands still and is silent but for greetings, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -50,6 +50,10 @@ class Paced:
         self.station.membership.drop(self.station.part.me)
         self._farewells = FAREWELLS
 
+    def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
+        """See `Station.change`."""
+        self._state = self.station.change(self._state, constraint, parameters)
+
     def step(self) -> float:
         """Do what is due; when to be called again at the latest."""
         station = self.station
@@ -78,7 +82,7 @@ class Paced:
 
     def _ready(self, now: float) -> bool:
         station = self.station
-        if station.body.position() is None:
+        if station.body.position() is None or not station.timed:
             return False
         heard = [np.isfinite(station.peers.all[neighbour].heard) for neighbour in station.present]
         if any(heard) and self._first_heard is None:
@@ -87,7 +91,7 @@ class Paced:
         self._begun = all(heard) or late
         if self._begun:
             self._due = self._last = now
-            self._state = station.core.begin(station.among(station.first()))
+            self._state = station.core.begin(station.among(station.first()), station.now())
         return self._begun
 
     def _turn(self, now: float) -> None:
@@ -95,13 +99,15 @@ class Paced:
         if station.changed:
             self._state = station.regroup(self._state, station.first())
             self._regrouped = self._count
+        self._state = station.reborn(self._state)
         inbox, arrived = station.empty()
         for neighbour, told in self._latest.items():
             station.sort(neighbour, told, inbox, arrived)
         self._latest.clear()
         moment = Moment(
-            float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place()
-        )
+            float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place(),
+            time=station.now(),
+        )  # fmt: skip
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1

@@ -68,26 +68,34 @@ class PairCore:
         self._end = np.array([order.index(neighbour.id) for neighbour in self.part.neighbours], dtype=int)
         self._begin, self._turn = _compiled()
 
-    def begin(self, first: np.ndarray) -> PairState:
-        return self._begin(self.protocol, self.solver, first)
+    def begin(self, first: np.ndarray, time: float = 0.0) -> PairState:
+        return self._begin(self.protocol, self.solver, first, time)
 
     def turn(self, state: PairState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         heard = inbox.pair, arrived.pair, moment.fresh[self._end]
-        state, said, bound, least = self._turn(self.protocol, self.solver, self._packing, state, heard, (moment.round, moment.margin))
+        when = moment.round, moment.margin, moment.time
+        state, said, bound, least = self._turn(self.protocol, self.solver, self._packing, state, heard, when)
         return Turned(state, Rows(inbox.link, np.asarray(said)), np.asarray(state.inner.x), float(bound), float(least))
 
-    def among(self, gone: Collection[str]) -> PairCore:
-        return PairCore(self.protocol, self.whole, gone)
+    def among(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
+        return PairCore(self.protocol, whole or self.whole, gone)
 
-    def carry(self, other: Core, state: PairState, first: np.ndarray) -> PairState:
+    def anew(self, state: PairState) -> PairState:
+        """With a count of changes that is larger by one, and nothing proven."""
+        memory: Any = state.inner.memory
+        more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # nothing compiles
+        forgotten: Any = np.full(2, np.inf)
+        return state._replace(inner=state.inner._replace(memory=memory._replace(**more)), bounds=forgotten)
+
+    def carry(self, other: Core, state: PairState, first: np.ndarray, time: float = 0.0) -> PairState:
         """Only the estimates live on, and the count of changes, which this is one of."""
-        fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)))
+        fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)), time)
         memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
         return fresh._replace(inner=fresh.inner._replace(memory=memory))
 
 
-def _begin(protocol: InteriorPoint, solver: Alone, first: Array) -> PairState:
-    return _strong(PairState(protocol.start(first, solver), jnp.full(2, jnp.inf), jnp.zeros(())))
+def _begin(protocol: InteriorPoint, solver: Alone, first: Array, time: Array) -> PairState:
+    return _strong(PairState(protocol.start(first, solver.at(time)), jnp.full(2, jnp.inf), jnp.zeros(())))
 
 
 def _strong(state: PairState) -> PairState:
@@ -102,9 +110,10 @@ def _turn(
     packing: Packing,
     state: PairState,
     heard: tuple[Array, Array, Array],
-    moment: tuple[Array, Array],
+    moment: tuple[Array, Array, Array],
 ) -> tuple[PairState, Array, Array, Array]:
-    (inbox, arrived, fresh), (round_, margin) = heard, moment
+    (inbox, arrived, fresh), (round_, margin, time) = heard, moment
+    solver = solver.at(time)
     interior = solver.interior
     assert interior is not None
     inner = protocol.hear(state.inner, packing.unpack(inbox, interior.plan.width), arrived, solver)

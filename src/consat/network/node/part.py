@@ -78,6 +78,8 @@ class _File(Model):
     hops: Annotated[int, Field(ge=0, le=10**6)]
     first: dict[Word, tuple[Number, ...]]
     absent: tuple[Word, ...] = ()
+    epoch: Number | None = None
+    generation: Annotated[int, Field(ge=0, le=10**9)] = 0
     neighbours: tuple[Neighbour, ...] = ()
     scenario: dict[str, Any]
 
@@ -103,6 +105,9 @@ class Part:
         first: (copies, d) first estimates of the positions it holds, in the order of `team.ids`.
         absent: agents that are not there in the beginning, and may join.
         neighbours: whom it talks to, in the team's order.
+        epoch: when t = 0 is, s of Unix time; None where nobody has said yet.
+        generation: how often the team has been split anew since it began: agents of other generations are not understood, for what they say
+            may travel along other links.
     """
 
     name: str
@@ -121,6 +126,8 @@ class Part:
     first: np.ndarray
     absent: frozenset[str]
     neighbours: tuple[Neighbour, ...]
+    epoch: float | None = None
+    generation: int = 0
 
     @property
     def nu(self) -> Nu:
@@ -138,7 +145,7 @@ class Part:
             "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "psi": self.psi,
             "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex, "exact": self.exact,
             "settings": settings,
-        }  # fmt: skip
+        } | ({"generation": self.generation} if self.generation else {})  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
 
     def without(self, gone: Collection[str]) -> Part:
@@ -204,6 +211,8 @@ def split(
     port: int = PORT,
     absent: Collection[str] = (),
     only: str | None = None,
+    epoch: float | None = None,
+    generation: int = 0,
 ) -> dict[str, Part]:
     """The parts of a scenario, by agent.
 
@@ -216,6 +225,8 @@ def split(
         port: the first of them.
         absent: agents that are not there in the beginning, and may join.
         only: make the part of this agent alone.
+        epoch: when t = 0 is, s of Unix time.
+        generation: see `Part`.
 
     Raises:
         InvalidTeam: a cluster is not connected by links.
@@ -274,6 +285,7 @@ def split(
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
+            epoch, generation,
         )  # fmt: skip
     return parts
 
@@ -305,6 +317,8 @@ def write_part(part: Part) -> str:
             "hops": part.hops,
             "first": {agent: row.tolist() for agent, row in zip(part.team.ids, part.first, strict=True)},
             "absent": sorted(part.absent),
+            **({} if part.epoch is None else {"epoch": part.epoch}),
+            **({"generation": part.generation} if part.generation else {}),
             "neighbours": [neighbour.model_dump(mode="json") for neighbour in part.neighbours],
             "scenario": scenario.plain,
         }
@@ -349,7 +363,8 @@ def read_part(text: str, file: str) -> Part:
     return Part(
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
         frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
-        np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
+        np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours, frame.epoch,
+        frame.generation,
     )  # fmt: skip
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from consat.engine.live import Live
 from consat.network.node.part import Part
 from consat.numerics import Groups
 from consat.problem.objective import Nu, Objective
@@ -69,10 +71,12 @@ class Alone(LocalSolver):
 
     Attributes:
         links: its ends of its links.
+        live: the parameters of its constraints, and how they move.
         me: its own row.
     """
 
     links: OwnLinks
+    live: Live
     me: int = field(metadata={"static": True})
 
     @classmethod
@@ -95,12 +99,24 @@ class Alone(LocalSolver):
             hops=part.hops,
             convex=part.convex,
             precision=EXACT,
+            live=live_of(part),
             me=me,
         )
 
+    def at(self, time: Array | float) -> Self:
+        """With the constraints as they are at a time, s since t = 0."""
+        return self.with_parameters(self.live.at(jnp.asarray(time)))
+
+
+def live_of(part: Part) -> Live:
+    """The parameters of an agent's constraints: arguments of what is compiled, so that nothing compiles when they change."""
+    live = Live.of(part.team, 1.0, all_of_them=True)
+    assert live is not None
+    return live
+
 
 def _plan(part: Part, me: int) -> prox.Plan:
-    plan = prox.buckets(part.team, lambda _, position: position, part.team.count, part.convex)
+    plan = prox.buckets(part.team, lambda _, position: position, part.team.count, part.convex, live=True)
     batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
     return prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1)
 

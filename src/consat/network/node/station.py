@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, Literal
 
 import numpy as np
 
+from consat.errors import Fault, InvalidTeam
 from consat.network.node import guard
 from consat.network.node.body import Body
 from consat.network.node.core import LARGEST, Embodied, Look, Moment, Rows
@@ -15,6 +18,9 @@ from consat.network.node.neighbours import Peers
 from consat.network.node.part import Part
 from consat.network.transports import Transport
 from consat.network.wire import Expected, Kind, Message, Numbers
+from consat.numerics import float64
+from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
+from consat.problem.schedule import Schedule
 
 SILENT: Final = 0.5
 """A neighbour that was not heard for so long, s, counts as down."""
@@ -42,6 +48,7 @@ class Station:
         stamped: whether it also carries the number of the round.
         give_up: a neighbour silent for so long has left for good, s.
         report: time between two reports, s; 0 reports after each turn.
+        wall: Unix time, s; what the agents of a team have in common.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class Station:
         stamped: bool = False,
         give_up: float = np.inf,
         report: float = REPORT,
+        wall: Callable[[], float] = time.time,
     ) -> None:
         self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
         self.membership = Membership(part)
@@ -74,6 +82,8 @@ class Station:
             incarnation,
         )
         self._log, self._give_up, self._period = log, give_up, report
+        self.epoch, self._wall = part.epoch, wall
+        self._time, self._restarts = 0.0, 0
         self._born = clock()
         self._track: list[list[float]] = []
         self._known: Knowledge = None
@@ -103,7 +113,7 @@ class Station:
             before, self.core = self.core, self.core.among(gone)
             self._gone, self._look = gone, None
             if state is not None:
-                state = self.core.carry(before, state, self.among(first))
+                state = self.core.carry(before, state, self.among(first), self._time)
         place = {end: k for k, end in enumerate(self.core.ends)}
         self._places = {
             neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
@@ -130,6 +140,11 @@ class Station:
         return first
 
     @property
+    def estimates(self) -> dict[str, np.ndarray]:
+        """(d,) its newest estimate of each position that it holds."""
+        return {} if self._look is None else dict(zip(self.core.part.team.ids, self._look.x, strict=True))
+
+    @property
     def satisfied(self) -> bool:
         """Whether it knows that all are."""
         return self._known == "satisfied"
@@ -143,6 +158,38 @@ class Station:
     def settled(self) -> bool:
         """Whether it knows all that there is to find: that all are satisfied, or that they cannot be and are near the best."""
         return self.satisfied or (self._known == "infeasible" and self._near)
+
+    # -- what constraints it has -------------------------------------------------------------------------------------------------------
+
+    @float64
+    def change(self, state: Any, constraint: str, parameters: Mapping[str, Any]) -> Any:
+        """Go on with other parameters of an own constraint, checked as those of a scenario: the core, and the state for it. Whatever was
+        proven is not so any more.
+
+        Raises:
+            InvalidTeam: no such constraint or parameter, or a value that it cannot have; nothing has changed.
+        """
+        team = self.part.team
+        changes = changes_of(team, self.part.me, constraint, parameters)
+        if self.epoch is None and any(isinstance(value, Schedule) for change in changes for value in change.given.values()):
+            message = "it moves with time, but nobody has said when t = 0 is; start the agent with --epoch"
+            raise InvalidTeam([Fault((), message, f"agent {self.part.me!r}, constraint {constraint!r}")])
+        before = self.core
+        if is_adjustment(team, changes):
+            self.part = replace(self.part, team=adjusted(team, changes))
+            self.core = before.adjusted(self.part)
+            state = state and self.core.anew(state)
+        else:
+            self.part = replace(self.part, team=changed(team, changes))
+            self.core = before.among(self._gone, self.part)
+            state = state and self.core.carry(before, state, self.among(self.first()), self._time)
+        self.log("changed", constraint=constraint, parameters=dict(parameters))
+        return state
+
+    def reborn(self, state: Any) -> Any:
+        """The state after neighbours have begun anew since this was last asked: their constraints may be others than before."""
+        before, self._restarts = self._restarts, sum(peer.restarts for peer in self.peers.all.values())
+        return state if before == self._restarts else self.core.anew(state)
 
     # -- messages ----------------------------------------------------------------------------------------------------------------------
 
@@ -194,6 +241,7 @@ class Station:
 
     def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, Look]:
         """See `Embodied.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
+        self._time = moment.time
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
             self.log("refused", peer=neighbour)
@@ -222,6 +270,15 @@ class Station:
         return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
 
     # -- time and place --------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def timed(self) -> bool:
+        """Whether it knows what its constraints are now: they do not move, or it knows when t = 0 is."""
+        return self.epoch is not None or not self.part.team.moves
+
+    def now(self) -> float:
+        """By the clock that the team shares, s since t = 0; 0 where nobody has said when that is."""
+        return 0.0 if self.epoch is None else self._wall() - self.epoch
 
     def delays(self) -> np.ndarray:
         """(E,) half the round trip to the neighbour of each end, s; 0 before it is known."""
@@ -313,11 +370,11 @@ class Station:
         look, position = self._look, self.body.position()
         margin = estimate_margin = None
         if look is not None:
-            estimate_margin = _number(self.core.margin(look.x))
+            estimate_margin = _number(self.core.margin(look.x, self._time))
             if look.heard and position is not None:
                 bodies = look.bodies.copy()
                 bodies[self._me()] = position
-                margin = _number(self.core.margin(bodies))
+                margin = _number(self.core.margin(bodies, self._time))
         peers = {}
         for neighbour, peer in self.peers.all.items():
             if neighbour not in self._gone:

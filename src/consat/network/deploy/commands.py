@@ -1,0 +1,229 @@
+"""Timed changes of a team that runs: a file of commands, all of it checked before anything starts.
+
+It is a YAML list of mappings, or JSON, one object a line: ``{"at": 2.0, "agent": "a1", "command": "change", "constraint": "goal", …}``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from consat.errors import AT_KEY, Fault, InvalidTeam, Place, closest, shown
+from consat.problem.changes import adjusted, changed, changes_of, is_adjustment, place_of
+from consat.problem.graphs import require_connected
+from consat.problem.team import Team
+from consat.scenario.document import Document, Node, decode, read
+
+COMMANDS: Final[dict[str, tuple[str, ...]]] = {
+    "change": ("agent", "constraint"), "leave": ("agent",), "join": ("agent",), "connect": ("agents",), "disconnect": ("agents",),
+}  # fmt: skip
+"""And which keys each must have besides `at`; a change has parameters besides, the others no more."""
+RELINK: Final = ("connect", "disconnect")
+
+
+class Stage(NamedTuple):
+    """How a team stands between two commands.
+
+    Attributes:
+        since: s since t = 0.
+        team: all agents that there ever are, with their constraints and links as they are.
+        present: who is there.
+    """
+
+    since: float
+    team: Team
+    present: frozenset[str]
+
+    def there(self) -> tuple[Team, np.ndarray]:
+        """The team of those who are there, and their places in the whole."""
+        places = np.array([i for i, agent in enumerate(self.team.ids) if agent in self.present])
+        return (self.team, places) if len(places) == self.team.count else (self.team.part(places)[0], places)
+
+
+@dataclass(frozen=True)
+class Timed:
+    """One command.
+
+    Attributes:
+        at: s since t = 0.
+        command: see `COMMANDS`.
+        agents: whom it is about.
+        constraint: of a change.
+        parameters: of a change, as a scenario has them.
+        after: how the team stands then.
+    """
+
+    at: float
+    command: str
+    agents: tuple[str, ...]
+    constraint: str
+    parameters: Mapping[str, Any]
+    after: Stage
+
+
+class Script(NamedTuple):
+    """Commands in the order of their times, and how the team stands at the beginning: whose first command is to join is not there."""
+
+    begin: Stage
+    commands: tuple[Timed, ...]
+
+    @property
+    def stages(self) -> list[Stage]:
+        """One after the other."""
+        return [self.begin, *(each.after for each in self.commands)]
+
+
+def no_commands(team: Team) -> Script:
+    """Nothing changes."""
+    return Script(Stage(0.0, team, frozenset(team.ids)), ())
+
+
+def load_commands(file: Path, team: Team, mode: str, until: float | None) -> Script:
+    """Read a file of commands for a team.
+
+    Args:
+        file: YAML or JSON lines.
+        team: as it is at the beginning.
+        mode: how its agents talk.
+        until: when the launch ends, s, if that is known.
+
+    Raises:
+        InvalidScenario: names every fault with its line and column.
+        OSError: the file cannot be read.
+    """
+    return read_commands(decode(file.read_bytes(), str(file)), str(file), team, mode, until)
+
+
+def read_commands(text: str, file: str, team: Team, mode: str, until: float | None = None) -> Script:
+    """See `load_commands`."""
+    document = _document(text, file)
+    entries = document.root.plain if document.root else []
+    if not isinstance(entries, list):
+        raise document.invalid([Fault((), "it must be a list of commands, such as - {at: 2, agent: a1, command: leave}", "commands")])
+    faults = [fault for k, entry in enumerate(entries) for fault in _faults(k, entry, team, mode, until)]
+    if faults or document.faults:
+        raise document.invalid(faults)
+    order = sorted(range(len(entries)), key=lambda k: entries[k]["at"])
+    first: dict[str, str] = {}
+    for k in order:
+        if "agent" in entries[k]:
+            first.setdefault(entries[k]["agent"], entries[k]["command"])
+    stage = begin = Stage(0.0, team, frozenset(team.ids) - {agent for agent, command in first.items() if command == "join"})
+    if not begin.present:
+        raise document.invalid([Fault((), "nobody is there at the beginning; whose first command is to join is not", "commands")])
+    commands = []
+    for k in order:
+        try:
+            command = _after(stage, entries[k])
+        except InvalidTeam as error:
+            faults += [replace(fault, path=(k, *fault.path)) for fault in error.faults]
+            continue
+        commands.append(command)
+        stage = command.after
+    if faults:
+        raise document.invalid(faults)
+    return Script(begin, tuple(commands))
+
+
+def _document(text: str, file: str) -> Document:
+    """A list, of lines of JSON or of YAML."""
+    if not text.lstrip().startswith("{"):
+        return read(text, file)
+    nodes, faults = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip():
+            one = read(line, file, lambda mark, number=number: Place(number, mark.column + 1, file))  # type: ignore[misc]
+            faults += one.faults
+            nodes += [] if one.root is None else [one.root]
+    return Document(file, Node(nodes, Place(1, 1, file)), faults)
+
+
+def _faults(k: int, entry: Any, team: Team, mode: str, until: float | None) -> Iterator[Fault]:
+    """What is wrong with an entry by itself."""
+    where = f"command {k + 1}"
+    if not isinstance(entry, dict):
+        yield Fault((k,), f"it is {shown(entry)}, but must be a mapping such as {{at: 2, agent: a1, command: leave}}", where)
+        return
+    at, command = entry.get("at"), entry.get("command")
+    if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < math.inf:
+        yield Fault((k, "at") if "at" in entry else (k,), f"at is {shown(at)}, but must be a time from 0, s", where)
+    elif until is not None and at > until:
+        yield Fault((k, "at"), f"at is {at:g} s, but the launch ends after {until:g} s", where)
+    if not isinstance(command, str) or command not in COMMANDS:
+        path = (k, "command") if "command" in entry else (k,)
+        yield Fault(path, f"the command is {shown(command)}{closest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}", where)
+        return
+    if mode == "lockstep" and command in ("change", *RELINK):
+        yield Fault((k, "command"), f"mode lockstep goes as consat run does, whose team stays; {command} needs another mode", where)
+    for key in COMMANDS[command]:
+        if key not in entry:
+            yield Fault((k,), f"{command} lacks {key}", where)
+    allowed = ("at", "command", *COMMANDS[command])
+    if command != "change" and (unknown := [key for key in entry if key not in allowed]):
+        yield Fault((k, unknown[0]), f"{command} has no key {shown(unknown[0])}; it has {', '.join(allowed)}", where, AT_KEY)
+    if command == "change" and len(entry) == len(allowed):
+        yield Fault((k,), "change names no parameter, such as radius: 2", where)
+    yield from _unknown(k, entry, command, team, where)
+
+
+def _unknown(k: int, entry: Mapping[str, Any], command: str, team: Team, where: str) -> Iterator[Fault]:
+    if command in RELINK:
+        pair = entry.get("agents")
+        if pair is not None and not (isinstance(pair, list) and len(pair) == 2 and pair[0] != pair[1]):
+            yield Fault((k, "agents"), f"agents is {shown(pair)}, but must be two agents such as [a1, a2]", where)
+            return
+        named: list[tuple[tuple[int | str, ...], Any]] = [((k, "agents", j), agent) for j, agent in enumerate(pair or [])]
+    else:
+        named = [((k, "agent"), entry["agent"])] if "agent" in entry else []
+    ids = list(team.ids)
+    for path, agent in named:
+        if not isinstance(agent, str) or agent not in ids:
+            yield Fault(path, f"there is no agent {shown(agent)}{closest(agent, ids)}", where)
+
+
+def _after(stage: Stage, entry: Mapping[str, Any]) -> Timed:
+    """The command, and how the team stands after it. Raises: InvalidTeam: it cannot be carried out there."""
+    at, command = float(entry["at"]), entry["command"]
+    given = {key: value for key, value in entry.items() if key not in ("at", "command", *COMMANDS[command])}
+    if command in RELINK:
+        agents = tuple(entry["agents"])
+        return Timed(at, command, agents, "", {}, Stage(at, _relinked(stage, command, agents), stage.present))
+    agent, team, present = entry["agent"], stage.team, stage.present
+    if (command == "join") == (agent in present):
+        message = "it is there already" if command == "join" else f"it is not there at {at:g} s"
+        raise InvalidTeam([Fault(("agent",), message, f"agent {agent!r}")])
+    if command == "change":
+        changes = changes_of(team, agent, entry["constraint"], given)
+        team = (adjusted if is_adjustment(team, changes) else changed)(team, changes)
+    else:
+        present = present - {agent} if command == "leave" else present | {agent}
+        if not present:
+            raise InvalidTeam([Fault(("agent",), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
+        _require_connected(Stage(at, team, present), "agent", f"{'without' if command == 'leave' else 'with'} agent {agent!r}")
+    return Timed(at, command, (agent,), entry.get("constraint", ""), given, Stage(at, team, present))
+
+
+def _relinked(stage: Stage, command: str, agents: tuple[str, ...]) -> Team:
+    team, where = stage.team, f"link [{', '.join(agents)}]"
+    pair = sorted(place_of(team, agent) for agent in agents)
+    there = (team.links == np.array(pair)).all(axis=1)
+    if bool(there.any()) == (command == "connect"):
+        message = "they are linked already" if command == "connect" else "there is no such link"
+        raise InvalidTeam([Fault(("agents",), message, where)])
+    links = np.concatenate([team.links, np.array([pair], dtype=np.int32)]) if command == "connect" else team.links[~there]
+    new = team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))])
+    _require_connected(stage._replace(team=new), "agents", f"without the {where}")
+    return new
+
+
+def _require_connected(stage: Stage, key: str, where: str) -> None:
+    """Raises: InvalidTeam: agents that depend on each other could not reach one another."""
+    try:
+        require_connected(stage.there()[0])
+    except InvalidTeam as error:
+        raise InvalidTeam([replace(fault, path=(key,), where=where) for fault in error.faults]) from None

@@ -1,0 +1,188 @@
+"""Changes of constraints while a team is at work: which parameters, checked as those of a scenario are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from consat.errors import Fault, InvalidTeam, closest, shown
+from consat.problem.constraints.library import ADJUSTABLE, adjustable
+from consat.problem.constraints.record import Number, Vector, flatten
+from consat.problem.family import Family
+from consat.problem.parameters import Moving, checked, still
+from consat.problem.schedule import Schedule
+from consat.problem.team import Team
+
+WEIGHT: Final = Number(None, positive=True)
+
+
+class Change(NamedTuple):
+    """New parameters of one constraint.
+
+    Attributes:
+        number: of the constraint, in the team's order.
+        family: which family it is in, …
+        member: … and its place there.
+        given: arrays or schedules, by the names of the parameters; ``weight`` may be among them.
+    """
+
+    number: int
+    family: int
+    member: int
+    given: Mapping[str, Moving]
+
+
+def changes_of(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[Change]:
+    """What changes when a constraint, or every side of a box, gets other parameters.
+
+    Args:
+        team: as it is now.
+        agent: whose constraint it is.
+        constraint: its name.
+        parameters: as a scenario has them, such as ``center=[3, 1]``.
+
+    Raises:
+        InvalidTeam: no such agent, constraint or parameter, or a value that it cannot have.
+    """
+    changes = []
+    for number, given in _sides(team, agent, constraint, parameters):
+        f, m = located(team, number)
+        changes.append(Change(number, f, m, _checked(team, number, team.families[f], given)))
+    return changes
+
+
+def is_structural(team: Team, changes: Sequence[Change]) -> bool:
+    """Whether a change concerns more than the values of parameters that stay as they are: then rounds are compiled once more."""
+    return any(
+        key == "weight" or isinstance(value, Schedule) or _moves(team.families[change.family], key, change.member)
+        for change in changes
+        for key, value in change.given.items()
+    )
+
+
+def is_adjustment(team: Team, changes: Sequence[Change]) -> bool:
+    """Whether only values of parameters change with which no constraint bends otherwise."""
+    return not is_structural(team, changes) and all(team.families[change.family].psi in ADJUSTABLE for change in changes)
+
+
+def changed(team: Team, changes: Sequence[Change]) -> Team:
+    """The team with other parameters, weights and schedules of some constraints."""
+    agents = list(team.agents)
+    start = np.searchsorted(team.owner, team.owner)
+    for change in changes:
+        number, given = change.number, change.given
+        i = int(team.owner[number])
+        own = list(flatten(agents[i].constraints))
+        k = number - int(start[number])
+        old = own[k]
+        parameters = {key: dataclasses.replace(each, value=given[key]) if key in given else each for key, each in old.parameters.items()}
+        own[k] = dataclasses.replace(old, parameters=parameters, weight=float(np.asarray(given.get("weight", old.weight))))
+        agents[i] = dataclasses.replace(agents[i], constraints=own)
+    return Team(agents, team.linked, team.dimension, unit=team.unit)
+
+
+def adjusted(team: Team, changes: Sequence[Change]) -> Team:
+    """The same for an adjustment: the families stay, and nothing that is known of them is asked again."""
+    families = list(team.families)
+    for change in changes:
+        family = families[change.family]
+        parameters = dict(family.parameters)
+        for key, value in change.given.items():
+            parameters[key] = np.array(parameters[key], dtype=float)
+            parameters[key][change.member] = value
+        families[change.family] = dataclasses.replace(family, parameters=parameters)
+    return team.with_constraints(families, team.owner, team.names)
+
+
+def place_of(team: Team, agent: str) -> int:
+    """The place of an agent. Raises: InvalidTeam: there is no such agent."""
+    found = next((k for k, each in enumerate(team.ids) if each == agent), None)
+    if found is None:
+        raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(agent, team.ids)}", f"agent {shown(agent)}")])
+    return found
+
+
+def located(team: Team, number: int) -> tuple[int, int]:
+    """In which family a constraint is, and at which place there."""
+    for f, family in enumerate(team.families):
+        if len(where := np.flatnonzero(family.number == number)):
+            return f, int(where[0])
+    raise IndexError(number)
+
+
+def named(team: Team, agent: str, constraint: str) -> list[int]:
+    """The places of an agent's constraint of this name; of all sides of a box. Raises: InvalidTeam: there is none."""
+    i = place_of(team, agent)
+    low, high = np.searchsorted(team.owner, [i, i + 1])
+    names = {team.names[k]: k for k in range(int(low), int(high))}
+    if not isinstance(constraint, str):
+        raise InvalidTeam([Fault((), f"the name of a constraint must be a text, but is {shown(constraint)}", f"agent {agent!r}")])
+    if constraint in names:
+        return [names[constraint]]
+    sides = [k for name, k in names.items() if name.startswith((f"{constraint}.low[", f"{constraint}.high["))]
+    if not sides:
+        own = ", ".join(map(repr, list(names)[:8])) or "none"
+        message = f"there is no constraint {shown(constraint)}{closest(constraint, names)}; it has {own}"
+        raise InvalidTeam([Fault((), message, f"agent {agent!r}")])
+    return sides
+
+
+def _sides(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[tuple[int, Mapping[str, Any]]]:
+    """Which constraints are changed, and which of their parameters; of a box ``low`` and ``high`` are those of its sides."""
+    numbers = named(team, agent, constraint)
+    if len(numbers) == 1:
+        return [(numbers[0], parameters)]
+    where = f"agent {agent!r}, constraint {constraint!r}"
+    if unknown := [key for key in parameters if key not in ("low", "high", "weight")]:
+        raise InvalidTeam([Fault((), f"there is no parameter {unknown[0]!r}; it has low, high and weight", where)])
+    own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
+    limits = {side: parameters.get(side, _parameter(team, k, side)) for side, k in own.items()}
+    faults: list[Fault] = []
+    checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
+    if faults:
+        raise InvalidTeam(faults)
+    return [
+        (k, given)
+        for k in numbers
+        if (given := {key: value for key, value in parameters.items() if key == "weight" or f".{key}[" in team.names[k]})
+    ]
+
+
+def _parameter(team: Team, number: int, key: str) -> Moving:
+    """A parameter as it is, with its schedule if it moves."""
+    f, m = located(team, number)
+    family = team.families[f]
+    track = family.tracks.get(key)
+    return (track and track.schedule(m)) or np.asarray(family.parameters[key])[m]
+
+
+def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) -> dict[str, Moving]:
+    """The values of changed parameters, as arrays or schedules. Raises: InvalidTeam."""
+    where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
+    faults: list[Fault] = []
+    values: dict[str, Moving] = {}
+    allowed = adjustable(family.psi, family.parameters)
+    for key, value in given.items():
+        if key not in allowed and key != "weight":
+            names = ", ".join([*allowed, "weight"])
+            faults.append(Fault((key,), f"there is no parameter {key!r} to change{closest(key, allowed)}; it has {names}", where))
+            continue
+        parameter = dataclasses.replace(allowed.get(key, WEIGHT), value=value)
+        found = (still if key == "weight" else checked)(parameter, team.dimension, (key,), key, where, faults)
+        if found is None:
+            continue
+        shape = family.parameters[key].shape[1:] if key != "weight" else ()
+        if (found.values.shape[1:] if isinstance(found, Schedule) else found.shape) != shape:
+            faults.append(Fault((key,), f"{key} is {shown(value)}, but must have shape {shape}", where))
+        values[key] = found
+    if faults:
+        raise InvalidTeam(faults)
+    return values
+
+
+def _moves(family: Family, key: str, member: int) -> bool:
+    track = family.tracks.get(key)
+    return track is not None and track.schedule(int(member)) is not None
