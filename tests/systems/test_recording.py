@@ -128,7 +128,7 @@ def test_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
     with np.load(tmp_path / "checkpoint.npz", allow_pickle=False) as file:
         assert all(file[name].dtype != object for name in file.files)
         meta = json.loads(file["meta"].tobytes())
-    assert meta["schema"] == "consat.checkpoint/1"
+    assert meta["schema"] == "consat.checkpoint/2"
 
 
 def test_record_is_thinned_and_sampled(tmp_path: Path) -> None:

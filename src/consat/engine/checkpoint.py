@@ -19,7 +19,7 @@ import numpy as np
 from consat.errors import InvalidResult
 from consat.problem.team import Team
 
-SCHEMA = "consat.checkpoint/1"
+SCHEMA = "consat.checkpoint/2"
 NAME = "checkpoint.npz"
 SHARE = 0.05
 """Of the time of a run, that writing checkpoints may take at most."""
