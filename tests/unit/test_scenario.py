@@ -58,9 +58,12 @@ def best_margin(team: cs.Team) -> float:
 
 # The packaged scenarios.
 
+DRIVEN = ("corridor", "escort", "swap", "warehouse")
+"""Those of robots."""
+
 
 def test_packaged_names() -> None:
-    assert packaged() == (*CASES, "convoy", "example-1", "lattice", "swarm")
+    assert packaged() == tuple(sorted((*CASES, *DRIVEN, "convoy", "example-1", "lattice", "swarm")))
 
 
 @pytest.mark.parametrize("name", packaged())
@@ -72,7 +75,8 @@ def test_packaged_scenario_says_what_it_shows(name: str) -> None:
     assert (scenario.name, scenario.source, scenario.text) == (name, name, packaged_text(name))
     assert scenario.team.dimension == 2
     assert not disconnected(scenario.team)
-    assert np.isnan(scenario.team.starts).all()
+    assert (scenario.robots is not None) == (name in DRIVEN)
+    assert name in DRIVEN or np.isnan(scenario.team.starts).all()
     assert scenario.settings.protocol == ProtocolSettings()
 
 
@@ -326,9 +330,14 @@ def test_dump_says_everything() -> None:
 @pytest.mark.parametrize("name", packaged())
 def test_dump_of_a_packaged_scenario(name: str) -> None:
     scenario = load(name)
-    text = dump(scenario.team, scenario.settings, name)
-    assert same(loads(text).team, scenario.team)
-    assert loads(text).settings == scenario.settings
+    text = dump(scenario.team, scenario.settings, name, robots=scenario.robots, rate=scenario.rate)
+    again = loads(text)
+    assert same(again.team, scenario.team)
+    assert again.settings == scenario.settings
+    if scenario.robots is not None:
+        assert again.robots is not None
+        assert (again.robots.data, again.rate) == (scenario.robots.data, scenario.rate)
+        return
     body = [line for line in packaged_text(name).splitlines() if not line.startswith("#")]
     end = next(number for number, line in enumerate(body) if line.startswith("communication"))
     assert text.splitlines()[:end] == body[:end]  # the agents are written as a person would

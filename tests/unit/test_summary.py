@@ -59,7 +59,7 @@ def test_a_team_without_constraints_is_satisfied() -> None:
         ("out of time", "admm", ["--protocol max-min", "--stop converged"]),
         ("settled", "gradient-flow", ["--protocol max-min"]),
         ("out of time", "max-min", ["--rounds"]),
-        ("settled", "max-min", ["--seed"]),
+        ("settled", "max-min", ["--restarts"]),
         ("interrupted", "admm", []),
     ],
 )
