@@ -485,7 +485,8 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
         robots = Driven(state, world.drive.start(state), paths)
     bad = None if world.burst is None else jnp.zeros(world.pairs, bool)
     now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard, robots, bad)
-    return now, see(world, now, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
+    seen = see(world, now, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
+    return now, seen._replace(estimate=first)  # a protocol may begin from others
 
 
 def precision_for(count: int) -> prox.Precision:
