@@ -5,11 +5,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from consat.errors import InvalidScenario
 from consat.network.deploy.commands import read_commands
-from consat.scenario import load
+from consat.network.deploy.observer import Observer
+from consat.numerics import float64
+from consat.problem.objective import Nu
+from consat.runs.preparation import copies_of
+from consat.scenario import load, loads
+from consat.settings import ProtocolSettings
 
 CONSAT = [sys.executable, "-c", "from consat.cli import main; main()"]
 TEAM = load("case-c").team
@@ -90,3 +96,34 @@ def test_a_launch_with_a_fault_starts_nothing(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert done.stderr.startswith(f"{file}:1:79: agent 'a1', constraint 'goal': center has 1 entry, but must have 2")
     assert not done.stdout
+
+
+MOVING = """
+consat: 1
+agents:
+  - {id: a, start: [0, 0], constraints: [{kind: within, center: {times: [0, 2], values: [[0, 0], [2, 0]]}, radius: 1, name: goal}]}
+  - {id: b, start: [0, 0], constraints: [{kind: near, agent: a, radius: 2}]}
+"""
+
+
+@float64
+def test_an_observer_judges_each_moment_by_the_constraints_of_that_moment() -> None:
+    """Both stand at the origin while the goal goes away, then comes back at once by a change, after which b leaves."""
+    team = loads(MOVING).team
+    text = "- {at: 1.5, agent: a, command: change, constraint: goal, center: [0, 0]}\n- {at: 2, agent: b, command: leave}"
+    stages = read_commands(text, "c", team, "admm").stages
+    observer = Observer(team, np.zeros((2, 2)), "time")
+    observer.origin = 100.0
+    for agent in team.ids:
+        track = [[100.0 + 0.1 * k, 0.0, 0.0] for k in range(31)]
+        observer.take([{"event": "report", "id": agent, "t": 0.0, "track": track, "sent": {}, "peers": {}}])
+    observer.present = stages[-1].present
+    trace = observer.trace(copies_of(stages[-1].there()[0], ProtocolSettings()), Nu(5.0, 5.0), "out of time", {}, stages, 1.0)
+    early, late = trace.steps < 1.5 - 1e-6, trace.steps > 1.5 + 1e-6
+    np.testing.assert_allclose(trace.agent_margin[early, 0], 1 - trace.steps[early] ** 2, atol=1e-9)
+    np.testing.assert_allclose(trace.agent_margin[late, 0], 1.0)
+    assert (trace.position.shape[1:], trace.steps[-1]) == ((1, 2), pytest.approx(3.0))
+    assert trace.motion is not None
+    assert trace.motion["worst_margin_after"] == pytest.approx(trace.margin.min())
+    assert trace.motion["satisfied_share"] == pytest.approx(np.mean(trace.margin > 0))
+    assert 0.8 < trace.motion["satisfied_share"] < 0.85  # all but from 1 to 1.5 s, of 3 s

@@ -69,6 +69,13 @@ def bounds(team: Rehearsal, since: float = 0.0) -> list[float]:
     return [event["bound"] for event in events(team, "report") if event["bound"] is not None and event["t"] > since]  # type: ignore[misc, operator]
 
 
+def bounds_below(team: Rehearsal, text: str) -> list[float]:
+    """What is said in the next moments and is false of a team: bounds below the best margin, which is proven from below."""
+    best, since = cs.solve(loads(text))["bounds"][0], team.air.now
+    team.run(0.3)
+    return [bound for bound in bounds(team, since) if bound < best - 1e-9]
+
+
 @pytest.mark.parametrize("mode", ["interior-point", "admm"])
 def test_agents_follow_constraints_that_move_by_clocks_that_differ(mode: Mode) -> None:
     """The goal goes at 1.1 a second, so that clocks 50 ms apart place it 0.06 apart. Nobody proves anything of what does not stay."""
@@ -126,6 +133,7 @@ def test_a_changed_constraint_counts_from_the_next_turn_and_compiles_nothing() -
     reports = [event for event in events(team, "report") if event["id"] == "a1" and event["bound"] is not None]
     assert all(event["bound"] > 0 for event in reports if event["t"] > changed_at)  # type: ignore[operator]
     assert min(bounds(team)) >= best
+    assert not bounds_below(team, STILL)
     team.runners["a1"].change("goal", {"center": [20, 0]})
     team.run(8.0, lambda: knows(team) == {"infeasible"})
     assert knows(team) == {"infeasible"}
@@ -140,6 +148,19 @@ def test_what_was_proven_of_an_agent_that_begins_anew_with_other_constraints_is_
     team.start("a1")
     team.run(8.0, lambda: knows(team) == {"satisfied"})
     assert knows(team) == {"satisfied"}
+    assert not bounds_below(team, STILL)
+
+
+def test_nobody_proves_of_far_places_what_was_measured_near() -> None:
+    """Where all can be, hundreds of reaches away, is outside the region that proofs speak of."""
+    free = STILL.replace('{kind: expr, psi: "4 - norm2(a3 - [0, 1])", name: track}, ', "")
+    team = team_of(free)
+    team.run(8.0, lambda: knows(team) == {"satisfied"})
+    team.runners["a1"].change("goal", {"center": [3000, 0]})
+    team.run(4.0)
+    assert knows(team) == {"satisfied"}
+    assert not events(team, "infeasible")
+    assert np.hypot(*(team.positions()["a3"] - [3000, 0])) < 4
 
 
 def test_a_parameter_may_begin_to_move() -> None:

@@ -6,6 +6,8 @@ What it knows of the team beyond the neighbours must outlive neither a lie nor a
 * Whenever an agent's constraints change, because somebody has left or joined, it raises a count of changes, which travels with every
   message; all take over the largest. A proof counts only where it comes with the agent's own count, and begins anew when that rises. So
   every agent has one set of constraints for each count, and a bound is one on the margin of these.
+* A proof speaks of a region around the team's middle that everybody has known since the beginning. An agent whose constraints ask for more
+  than `FAR` reaches, because they were changed, tells no proof.
 * The least margin behind a neighbour that has fallen silent is unknown.
 """
 
@@ -25,11 +27,14 @@ from consat.network.node.pairs import Letter, Packing
 from consat.network.node.part import Part
 from consat.network.node.problem import Alone, ends
 from consat.numerics import quick_compilation
+from consat.problem.constraints.library import farthest
 from consat.protocols import InteriorPoint, Known
 from consat.protocols.interior_point import InteriorState
 
 FORGET: Final = 300
 """Turns."""
+FAR: Final = 3.0
+"""The region of a proof is ten reaches wide: so an agent may follow its neighbours some way farther than its own constraints ask for."""
 
 
 class PairState(NamedTuple):
@@ -64,6 +69,7 @@ class PairCore:
         self.letters = {neighbour.id: Letter.of(neighbour, whole.team.dimension).numbers() for neighbour in whole.neighbours}
         assert self.solver.interior is not None
         self._packing = Packing.of(whole, self.part, self.solver.interior.plan.width)
+        self._weight = {neighbour.id: Letter.of(neighbour, whole.team.dimension).weight for neighbour in whole.neighbours}
         order = [neighbour for neighbour, _ in self.ends]
         self._end = np.array([order.index(neighbour.id) for neighbour in self.part.neighbours], dtype=int)
         self._begin, self._turn = _compiled()
@@ -75,7 +81,18 @@ class PairCore:
         heard = inbox.pair, arrived.pair, moment.fresh[self._end]
         when = moment.round, moment.margin, moment.time
         state, said, bound, least = self._turn(self.protocol, self.solver, self._packing, state, heard, when)
-        return Turned(state, Rows(inbox.link, np.asarray(said)), np.asarray(state.inner.x), float(bound), float(least))
+        said = np.asarray(said)
+        if asks_for(self.part) > FAR * self.part.reach:
+            said, bound = self._without_proof(said), np.inf
+        return Turned(state, Rows(inbox.link, said), np.asarray(state.inner.x), float(bound), float(least))
+
+    def _without_proof(self, said: np.ndarray) -> np.ndarray:
+        said = said.copy()
+        for row, neighbour in zip(said, self.part.neighbours, strict=True):
+            at = self._weight[neighbour.id]
+            row[at:] = 0.0
+            row[at] = -1.0
+        return said
 
     def among(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
         return PairCore(self.protocol, whole or self.whole, gone)
@@ -92,6 +109,12 @@ class PairCore:
         fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)), time)
         memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
         return fresh._replace(inner=fresh.inner._replace(memory=memory))
+
+
+@functools.lru_cache(maxsize=64)
+def asks_for(part: Part) -> float:
+    """How far from the team's middle an agent's own constraints ask anybody to be, length."""
+    return max((farthest(family.psi, family.parameters, part.center) for family in part.team.families), default=0.0)
 
 
 def _begin(protocol: InteriorPoint, solver: Alone, first: Array, time: Array) -> PairState:

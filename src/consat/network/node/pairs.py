@@ -60,6 +60,11 @@ class Letter(NamedTuple):
         """How many numbers."""
         return HEAD + _both(self.size) + TAIL + _both(self.size - self.level)
 
+    @property
+    def weight(self) -> int:
+        """The place of Σλ, with which the proof begins."""
+        return HEAD + _both(self.size)
+
     def numbers(self) -> Numbers:
         """What such a message must be."""
         largest = np.full(self.length, LARGEST)

@@ -213,6 +213,31 @@ ADJUSTABLE: Final[Mapping[Callable[..., Any], Mapping[str, Parameter]]] = {
 """Of every function of the library the parameters that can be changed, and what these may be. None of them changes how it bends."""
 
 
+def farthest(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray], center: np.ndarray) -> float:
+    """How far from a place, (d,), the nearest position is that satisfies the one of some constraints that asks for most, as far as the
+    library knows; of `displacement` how far apart it keeps two agents.
+
+    Args:
+        psi: the function of these constraints.
+        parameters: arrays with leading axis M.
+        center: the place, length.
+    """
+    p = {key: np.asarray(value, dtype=float) for key, value in parameters.items()}
+    if psi is _within:
+        away = np.linalg.norm(p["center"] - center, axis=1) - p["radius"]
+    elif psi is _displacement:
+        away = np.linalg.norm(p["vector"], axis=1) - p["radius"]
+    elif psi is _halfspace:
+        away = (p["normal"] @ center - p["offset"]) / np.linalg.norm(p["normal"], axis=1)
+    elif psi is _above:
+        away = np.sum(p["axis"] * (p["low"] - center), axis=1)
+    elif psi is _below:
+        away = np.sum(p["axis"] * (center - p["high"]), axis=1)
+    else:
+        return 0.0
+    return float(away.max(initial=0.0))
+
+
 def adjustable(psi: Callable[..., Any], parameters: Iterable[str]) -> Mapping[str, Parameter]:
     """Which of its parameters can be changed in a constraint, and what these may be; none in a text expression, where numbers have no
     names."""
