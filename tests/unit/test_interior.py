@@ -262,3 +262,19 @@ def test_a_team_in_millimetres_and_the_same_in_kilometres_take_the_same_rounds()
         found.append(talk.run(25)[0].min(axis=1) / unit**2)
     assert np.allclose(*found, rtol=1e-5, atol=1e-7)
     assert found[0][-1] == pytest.approx(MARGINS["c"], abs=1e-3)
+
+
+def test_a_proof_speaks_of_wherever_constraints_lead() -> None:
+    """A chain of displacements leads far beyond the team's places, and a changed goal does: no bound is below what can be had there."""
+    agents = [
+        cs.Agent(f"a{k}", [cs.displacement(f"a{k - 1}", [1, 0], 0.3)] if k else [cs.within([0, 0], 1)], start=[k, 0]) for k in range(30)
+    ]
+    result = cs.run(cs.Team(agents, links="line"), protocol="max-min", rounds=120)
+    bound = result.data["bound"].values
+    assert np.isfinite(bound).any()
+    assert np.nanmin(bound) >= 0.09
+    session = cs.Session(cs.Team([cs.Agent("a", [cs.within([0, 0], 1, name="goal")]), cs.Agent("b", [cs.near("a", 1)])]))
+    session.step(10).change("a", "goal", center=[3000, 0])
+    for _ in range(60):
+        assert session.step().known != "infeasible"
+    assert session.satisfied

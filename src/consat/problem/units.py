@@ -18,6 +18,7 @@ import numpy as np
 from consat.numerics import float64, once
 from consat.problem.constraints.curvature import expand
 from consat.problem.constraints.domain import HUGE
+from consat.problem.constraints.library import farthest
 from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.settings import Smoothing
@@ -44,6 +45,7 @@ class Scale(NamedTuple):
         center: (d,) mean of the points that constraints on one agent alone point to.
         spread: largest distance of such a point from the centre on any axis.
         typical: the median of the scales of all ψ.
+        extent: how far, beyond that, constraints ask agents to be: from the centre, and one after the other from teammates.
     """
 
     psi: float
@@ -51,6 +53,7 @@ class Scale(NamedTuple):
     center: np.ndarray
     spread: float
     typical: float
+    extent: float = 0.0
 
     @property
     def reach(self) -> float:
@@ -96,8 +99,10 @@ def scale(team: Team) -> Scale:
     sizes = np.concatenate([psi[curved], slope[flat] * length])
     center = centers.mean(axis=0) if len(centers) else np.zeros(team.dimension)
     spread = float(np.abs(centers - center).max(initial=0.0))
+    apart = sum(float(m[4].sum()) for m in measured) / len(team.instants)
+    asked = [farthest(family.psi, family.parameters, center) for each in team.instants for family in each.families if family.arity == 1]
     smallest, typical = (float(sizes.min()), float(np.median(sizes))) if len(sizes) else (1.0, 1.0)
-    return Scale(smallest, length, center, spread, typical)
+    return Scale(smallest, length, center, spread, typical, apart + max(asked, default=0.0))
 
 
 def automatic(size: Scale) -> Smoothing:
@@ -126,8 +131,9 @@ def _second_order(
     return jax.vmap(both)(at, parameters)
 
 
-def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Scale, ‖H‖ and slope of each member, and the stationary points of those that read one agent alone."""
+def _measure(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
+    """Scale, ‖H‖ and slope of each member, the stationary points of those that read one agent alone, and of others how far apart these are
+    where ψ is stationary."""
     try:
         value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
     except ValueError:
@@ -141,10 +147,16 @@ def _measure(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np
     bend = np.where(usable, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
     psi_there = np.abs(value + 0.5 * np.einsum("mi,mi->m", b, stationary)) * family.weight
     centers = stationary[(bend > 0)] if family.arity == 1 else np.zeros((0, dimension))
-    return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers
+    return psi_there, bend * family.weight, np.linalg.norm(b, axis=1) * family.weight, centers, _between(stationary, family.arity)
 
 
-def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _between(stationary: np.ndarray, arity: int) -> np.ndarray:
+    """(M,) the largest distance between the positions of (M, arity·d) places; 0 of one position."""
+    x = stationary.reshape(len(stationary), arity, -1)
+    return np.asarray(np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0))
+
+
+def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
     """The same beyond degree 2: by one step of Newton from the origin, which says something where it leads to where ψ is flatter.
     Elsewhere ψ is as good as straight, and has its slope at the origin."""
 
@@ -162,4 +174,5 @@ def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, np.ndarray
     curved = usable & there & (np.linalg.norm(flatter, axis=1) <= FLATTER * steep)
     bend = np.where(curved, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
     centers = stationary[bend > 0] if family.arity == 1 else np.zeros((0, dimension))
-    return np.abs(value) * family.weight, bend * family.weight, steep * family.weight, centers
+    between = np.where(curved, _between(stationary, family.arity), 0.0)
+    return np.abs(value) * family.weight, bend * family.weight, steep * family.weight, centers, between

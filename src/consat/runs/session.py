@@ -26,13 +26,14 @@ from consat.engine.round import Body, Now, World, world_of
 from consat.engine.rounds import Tally, driven, known_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam, shown
 from consat.numerics import float64
-from consat.problem.changes import changed, changes_of, is_adjustment, is_structural, named, place_of
-from consat.problem.constraints.library import ADJUSTABLE
+from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, named, place_of
+from consat.problem.constraints.library import ADJUSTABLE, farthest
 from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import vector
 from consat.problem.team import Agent, Team
+from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
 from consat.protocols.interior_point import InteriorState
@@ -133,6 +134,7 @@ class Session:
         self._weather = self._options.weather(settings.start.seed)
         ready = Prepared.of(scenario.team, settings)
         self._engine = self._built(ready, ready.first(drive=self._body.drive), self._body)
+        self._extent = ready.size.extent / ready.size.length
         state, chunk = self._engine.carrier.start()
         self._state: Now = state
         self._tally, self._record = Tally(), Memory()
@@ -238,6 +240,7 @@ class Session:
         for change in changes:
             for key, value in change.given.items():
                 self._engine.live.parameters[change.family][key][change.member] = value
+            self._reach_out(change)
         self._note_changes({int(team.owner[change.number]) for change in changes})
         return self
 
@@ -454,7 +457,9 @@ class Session:
         """Go on with another structure; what everybody remembers of what stays is carried over. Nothing happens where that cannot be."""
         old = self._engine
         copies = copies_of(team, old.ready.settings.protocol)
-        ready = old.ready._replace(team=team, copies=copies)
+        now, size = scale(team), old.ready.size  # units stay, but proofs speak of wherever the team may now lead
+        extent = now.extent + now.reach + float(np.linalg.norm(np.asarray(now.center) - np.asarray(size.center)))
+        ready = old.ready._replace(team=team, copies=copies, size=size._replace(extent=max(size.extent, extent)))
         kind = str(ready.settings.protocol.kind)
         names = [Names.of(each.team, each.copies, pairs=kind in PAIRED) for each in (old.ready, ready)]
         first, place = self._first(ready)
@@ -471,6 +476,7 @@ class Session:
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
         self._engine, self._state, self._positions, self._margins, self._body = engine, state, place, margins, body
+        self._extent = max(self._extent, ready.size.extent / ready.size.length)
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
         """(C, d) estimates to begin with: of new copies where their owner is, and (N, d) bodies."""
@@ -513,6 +519,21 @@ class Session:
             for old, new in zip(before.families, team.families, strict=True)
             if old.psi not in ADJUSTABLE
         )
+
+    def _reach_out(self, change: Change) -> None:
+        """See that proofs speak of wherever a changed constraint may lead."""
+        size, carrier = self._engine.ready.size, self._engine.carrier
+        family = self._engine.ready.team.families[change.family]
+        if carrier.world.everyone.interior is None or family.psi not in ADJUSTABLE:
+            return
+        own = {key: np.asarray(array)[[change.member]] for key, array in self._engine.live.parameters[change.family].items()}
+        asked = farthest(family.psi, own, np.asarray(size.center)) / size.length
+        if asked <= self._extent:
+            return
+        self._extent = asked if family.arity == 1 else self._extent + asked  # apart from a teammate, who may be as far out as that
+        everyone, interior = carrier.world.everyone, carrier.world.everyone.interior
+        interior = dataclasses.replace(interior, units=interior.units._replace(extent=jnp.asarray(self._extent)))
+        carrier.world = dataclasses.replace(carrier.world, everyone=dataclasses.replace(everyone, interior=interior))
 
     def _note_changes(self, owners: Iterable[int]) -> None:
         """Those whose constraints have changed tell everybody that proofs begin anew."""

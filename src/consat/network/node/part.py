@@ -78,6 +78,7 @@ class _File(Model):
     hops: Annotated[int, Field(ge=0, le=10**6)]
     first: dict[Word, tuple[Number, ...]]
     absent: tuple[Word, ...] = ()
+    extent: Annotated[Number, Field(ge=0)] = 0.0
     epoch: Number | None = None
     generation: Annotated[int, Field(ge=0, le=10**9)] = 0
     neighbours: tuple[Neighbour, ...] = ()
@@ -108,6 +109,7 @@ class Part:
         epoch: when t = 0 is, s of Unix time; None where nobody has said yet.
         generation: how often the team has been split anew since it began: agents of other generations are not understood, for what they say
             may travel along other links.
+        extent: how far beyond `reach` constraints may lead, length; see `consat.problem.units.Scale`.
     """
 
     name: str
@@ -128,6 +130,7 @@ class Part:
     neighbours: tuple[Neighbour, ...]
     epoch: float | None = None
     generation: int = 0
+    extent: float = 0.0
 
     @property
     def nu(self) -> Nu:
@@ -143,7 +146,8 @@ class Part:
         settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
             "run": self.run, "mode": mode, "dimension": self.team.dimension, "length": self.length, "psi": self.psi,
-            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "convex": self.convex, "exact": self.exact,
+            "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "extent": self.extent, "convex": self.convex,
+            "exact": self.exact,
             "settings": settings,
         } | ({"generation": self.generation} if self.generation else {})  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
@@ -285,7 +289,7 @@ def split(
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
-            epoch, generation,
+            epoch, generation, size.extent,
         )  # fmt: skip
     return parts
 
@@ -312,6 +316,7 @@ def write_part(part: Part) -> str:
             "psi": part.psi,
             "center": part.center.tolist(),
             "reach": part.reach,
+            "extent": part.extent,
             "convex": part.convex,
             "exact": part.exact,
             "hops": part.hops,
@@ -364,7 +369,7 @@ def read_part(text: str, file: str) -> Part:
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
         frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
         np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours, frame.epoch,
-        frame.generation,
+        frame.generation, frame.extent,
     )  # fmt: skip
 
 

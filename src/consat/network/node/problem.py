@@ -133,7 +133,9 @@ def _interior(part: Part) -> Interior:
     one = team.with_constraints(families, np.zeros_like(team.owner), team.names)
     one.ids = (part.me,)
     copies = Estimates("local", np.zeros_like(number), number, me, none, np.zeros(1, dtype=np.int32), none)
-    units = Units(*(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length)))
+    units = Units(
+        *(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length, part.extent / part.length))
+    )
     shared = Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int), part.exact)
     return Interior.alone(one, copies, shared, units)
 

@@ -43,17 +43,25 @@ class Units(NamedTuple):
         length: the team's unit of length.
         psi: the team's unit of ψ.
         reach: how far the region reaches, in units of length.
+        extent: how far beyond it constraints may lead, in units of length.
     """
 
     center: Array
     length: Array
     psi: Array
     reach: Array
+    extent: Array
 
     @classmethod
     def of(cls, size: Scale) -> Units:
         """From the natural size of a team."""
-        return cls(jnp.asarray(size.center), jnp.asarray(size.length), jnp.asarray(size.typical), jnp.asarray(size.reach / size.length))
+        return cls(
+            jnp.asarray(size.center),
+            jnp.asarray(size.length),
+            jnp.asarray(size.typical),
+            jnp.asarray(size.reach / size.length),
+            jnp.asarray(size.extent / size.length),
+        )
 
 
 class Memory(NamedTuple):
@@ -514,7 +522,7 @@ def longest(lanes: Lanes, flat: Array, step: Array, least: Array, used: Array) -
 
 
 REGION = 10.0
-"""The region of which a proof speaks, in reaches of the team's places around their middle."""
+"""The region of which a proof speaks, in reaches of the team's places around their middle; and as far as constraints may lead."""
 SLACK = 3e-4
 """What that region may add to the bound at most, in units of ψ; a little more where agents without constraints relay."""
 IDLE = 0.01
@@ -549,7 +557,7 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
     eps = 8.0 * size * jnp.finfo(y.dtype).eps
     steep, far = jnp.abs(slope), jnp.abs(flat) + jnp.tile(lanes.units.reach + jnp.abs(lanes.units.center) / lanes.units.length, n)[:, None]
     sizes = jnp.abs(multiplier * psi).sum(axis=0) + jnp.sum((steep + times(jnp.abs(matrix), jnp.abs(flat))) * far, axis=0)
-    reach = REGION * lanes.units.reach
+    reach = REGION * lanes.units.reach + lanes.units.extent
     curve = SLACK / reach**2 * jnp.where(used.any(axis=0), weight, IDLE)
     own = (jnp.arange(size) < d)[:, None]
     absent = jnp.repeat(~held, d, axis=0, total_repeat_length=size)
