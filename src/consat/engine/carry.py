@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,9 @@ from consat.engine.round import Driven
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import Shared
-from consat.robots import Fleet
-from consat.robots.model import Model
+
+if TYPE_CHECKING:
+    from consat.robots.model import Model
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,8 @@ def _merged(old: Any, new: Any, places: tuple[np.ndarray, np.ndarray]) -> Any:
 
 def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence[str], after: Sequence[str]) -> Driven:
     """Robots of a team of other members: those who stay go on as they were, and what came of it so far stays."""
+    from consat.robots import Fleet
+
     report = new.memory.report._replace(
         **{name: getattr(old.memory.report, name) for name in old.memory.report._fields if name != "halted"}
     )
@@ -113,6 +116,8 @@ def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence
 
 def robot_placed(model: Model[Any], state: Any, i: int, place: np.ndarray) -> Any:
     """The state of robots of which one, i, is now at rest at its place among (N, d)."""
+    from consat.robots import Fleet
+
     if isinstance(model, Fleet):
         kind = int(model.kinds[i])
         rows = model.members[kind]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,11 @@ from jax import Array
 from consat.engine.recording import Choice
 from consat.engine.round import SATISFIED, Now, Seen, World, begin, one_round, see
 from consat.engine.violations import violated
-from consat.engine.ways import Ways
 from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
+
+if TYPE_CHECKING:
+    from consat.engine.ways import Ways
 
 CHUNK = 10
 """Rounds between two looks at the stop rule and the progress bar."""
@@ -271,7 +273,11 @@ class OneProcess:
         self._large = world.everyone.agents > LARGE
         self._protocol, self.world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
-        self._ways = None if world.drive is None or not world.drive.map.count else Ways(world.drive)
+        self._ways: Ways | None = None
+        if world.drive is not None and world.drive.map.count:
+            from consat.engine.ways import Ways
+
+            self._ways = Ways(world.drive)
 
     def start(self) -> tuple[Now, Chunk]:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,9 @@ from consat.protocols.interior_point import EXACTLY, near
 from consat.protocols.local import proximal as prox
 from consat.protocols.local.interior import Interior
 from consat.protocols.solver import EXACT, LocalSolver
-from consat.robots.drive import Drive
+
+if TYPE_CHECKING:
+    from consat.robots.drive import Drive
 
 PATH = 8
 """Waypoints of a path, of which few have so many; where one has more, rounds are compiled once more."""

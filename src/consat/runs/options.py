@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -16,9 +16,10 @@ from consat.engine.round import Body, Weather
 from consat.errors import InvalidSettings
 from consat.problem.team import Team
 from consat.protocols.estimates import Layout
-from consat.robots import Drive
-from consat.robots.description import Robots
 from consat.settings import Smoothing
+
+if TYPE_CHECKING:
+    from consat.robots.description import Robots
 
 RATE = 20.0
 """Rounds a second, Hz, where constraints move with time, or robots drive, and nobody says."""
@@ -75,6 +76,8 @@ class Options:
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
         """From `data`."""
+        from consat.robots.description import Robots
+
         smoothing, robots = data["smoothing"], data["robots"]
         made = {
             "smoothing": smoothing if smoothing in (None, "auto") else Smoothing.model_validate(smoothing),
@@ -120,6 +123,8 @@ class Options:
             raise InvalidSettings(f"wind is {list(self.wind)}, but must be {team.dimension} numbers, m/s")
         if not (math.isfinite(self.noise) and self.noise >= 0):
             raise InvalidSettings(f"noise is {self.noise}, but must be a length from 0, m")
+        from consat.robots import Drive
+
         model = self.robots.fleet(list(team.ids))
         drive = Drive(model, team.count, team.dimension, 1.0 / rate, self.robots.obstacles, noise=self.noise)
         return {"drive": drive, "wind": self.wind, "noise": self.noise}

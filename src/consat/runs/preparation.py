@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,10 +19,13 @@ from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
 from consat.protocols.estimates import Estimates, Layout
 from consat.protocols.local.interior import Way, route_of
-from consat.robots import Drive, start_faults
 from consat.runs.options import Options
 from consat.scenario import Scenario, dump, load
 from consat.settings import ProtocolSettings, Settings, Start
+
+if TYPE_CHECKING:
+    from consat.robots import Drive
+    from consat.robots.description import Robots
 
 DEFAULT_PROTOCOL = "interior-point"
 MANY = 5000
@@ -31,6 +34,15 @@ FULL = 30
 """Likewise teams of more agents than these where everybody holds everything."""
 SHARP = 5e-4
 """Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
+
+
+def robots_of(robots: Any, obstacles: Any, scenario: Scenario) -> Robots | None:
+    """The robots of a run; see `consat.robots.description.asked`. Nothing is loaded for a team of points."""
+    if robots is None and obstacles is None and scenario.robots is None:
+        return None
+    from consat.robots.description import asked
+
+    return asked(robots, obstacles, scenario.robots, scenario.team.ids)
 
 
 def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
@@ -190,6 +202,8 @@ def apart_from_all(team: Team, copies: Estimates, first: np.ndarray, drive: Driv
         InvalidTeam: starts that are given overlap.
         InvalidSettings: there is no room for all in the box.
     """
+    from consat.robots import start_faults
+
     random, first = np.random.default_rng([seed, 1]), first.copy()
     place, size, given = first[copies.own], np.asarray(drive.size), np.isfinite(team.starts).all(axis=1)
     if found := start_faults(list(team.ids), place[given], size[given], drive.map):

@@ -24,10 +24,9 @@ from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Estimates, Layout
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
-from consat.robots.description import asked
 from consat.runs.advice import around_loops
 from consat.runs.options import Options
-from consat.runs.preparation import Prepared, named, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.preparation import Prepared, named, robots_of, scenario_of, settings_of, told, with_auxiliary
 from consat.runs.restarting import best_start
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
@@ -117,9 +116,7 @@ def run(
     if checkpoint is not None and out is None:
         raise InvalidSettings("checkpoint needs out: the directory in which the checkpoint and the result stand")
     scenario = scenario_of(team)
-    options = dataclasses.replace(
-        options, robots=asked(robots, obstacles, scenario.robots, scenario.team.ids), rate=scenario.rate if rate is None else rate
-    )
+    options = dataclasses.replace(options, robots=robots_of(robots, obstacles, scenario), rate=scenario.rate if rate is None else rate)
     if out is not None:
         claim(Path(out), scenario.name, force=force)
     files = None if out is None else Files(Path(out), checkpoint)

@@ -40,9 +40,8 @@ from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior.layout import form_of
 from consat.results.result import Result
 from consat.results.trace import Trace
-from consat.robots.description import asked
 from consat.runs.options import RATE, Options
-from consat.runs.preparation import Prepared, copies_of, scenario_of, settings_of
+from consat.runs.preparation import Prepared, copies_of, robots_of, scenario_of, settings_of
 from consat.runs.summary import summarise
 from consat.scenario import Scenario
 from consat.settings import Smoothing
@@ -120,7 +119,7 @@ class Session:
         self._options = Options(
             protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, burst=burst,
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
-            robots=asked(robots, obstacles, scenario.robots, scenario.team.ids),
+            robots=robots_of(robots, obstacles, scenario),
         )  # fmt: skip
         self._name, self._source = scenario.name, scenario
         settings = settings_of(scenario.settings, self._options, scenario.team)
