@@ -1,4 +1,4 @@
-"""Ways round obstacles, planned on the host between two chunks of rounds, by each robot whose target has moved."""
+"""Ways round obstacles, planned on the host between chunks of rounds, by whose target has moved or who lost sight of its way."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from consat.robots import Drive, Planner
 
 MOVED = 0.5
 """Of a robot's size: a target that moved by so much wants another way."""
+
+
+WAITED = 1.0
+"""Who came no nearer for so long, s, looks whether it still sees where it goes: others may have pushed it behind a corner."""
 
 
 class Ways:
@@ -24,10 +28,16 @@ class Ways:
         self._planner = Planner(drive.map, float(np.max(drive.size)))
 
     def planned(self, robots: Driven, place: np.ndarray, targets: np.ndarray) -> Driven:
-        """With new ways, from (N, d) places to (N, d) targets, for robots whose targets are no longer where their ways end."""
+        """With new ways, from (N, d) places to (N, d) targets, for robots whose targets are no longer where their ways end, and for those
+        who wait without seeing the next waypoint."""
         assert robots.paths is not None
         paths = np.array(robots.paths)
-        anew = np.flatnonzero(np.linalg.norm(paths[:, -1] - targets, axis=1) > self._tolerance)
+        moved = np.linalg.norm(paths[:, -1] - targets, axis=1) > self._tolerance
+        waiting = np.flatnonzero(~moved & (np.asarray(robots.memory.waited) > WAITED))
+        if len(waiting):
+            ahead = paths[waiting, np.asarray(robots.memory.waypoint)[waiting]]
+            moved[waiting] = ~self._planner.seen(place[waiting], ahead)
+        anew = np.flatnonzero(moved)
         if not len(anew):
             return robots
         found = [self._planner.path(place[i], targets[i]) for i in anew.tolist()]
