@@ -142,23 +142,23 @@ class Drive:
         object.__setattr__(self, "explained", 4.0 * added)
 
     def start(self, state: Any) -> Memory:
-        """The memory at the start."""
+        """The memory at the start, of the types that it has after a step: a weak type would have programs compiled once more."""
         place = self.model.place(state)
-        zeros, none = jnp.zeros(self.count), jnp.asarray(jnp.inf)
+        zeros, never = jnp.zeros(self.count), jnp.full(self.count, jnp.inf, dtype=jnp.float64)
         pairs = self.count if self.count <= PAIRS_COUNTED else 0
-        report = Report(none, none, jnp.asarray(0), jnp.asarray(0), jnp.zeros(self.count, dtype=jnp.int64), jnp.asarray(0.0))
-        memory = Memory(
+        nothing, none = jnp.full((), jnp.inf, dtype=jnp.float64), jnp.zeros((), dtype=jnp.int64)
+        report = Report(nothing, nothing, none, none, jnp.zeros(self.count, dtype=jnp.int64), jnp.zeros(()))
+        return Memory(
             jnp.zeros_like(place),
             zeros,
             jnp.zeros(self.count, dtype=jnp.int64),
             jnp.full_like(place, LARGEST),
-            jnp.full(self.count, jnp.inf),
+            never,
             zeros,
             candidates(place),
             jnp.zeros((pairs, pairs), dtype=bool),
             report,
         )
-        return self.observed(state, memory)
 
     def step(
         self,
@@ -202,10 +202,9 @@ class Drive:
         underway = jnp.linalg.norm(targets - place, axis=1) >= self._tolerance()
         pace = model.approach(left, dt)
         seen = deadlock.sight(planes, place, size, memory.velocity, underway, around)
-        straight = safety.open_way(model, state, ahead * pace[:, None], everything, dt)
         wish = deadlock.bent(self.rules, ahead, pace, top, underway=underway, blocked=memory.blocked, seen=seen)
+        command, moves, straight = safety.steered(model, state, wish, ahead * pace[:, None], everything, dt)
         blocked = deadlock.refused(self.rules, memory.blocked, ahead, pace, straight, underway=underway, dt=dt)
-        command, moves = safety.filtered(model, state, wish, everything, dt)
         after = model.step(state, command, dt, wind)
 
         anew = jnp.linalg.norm(targets - memory.goal, axis=1) > self._tolerance()
@@ -227,10 +226,13 @@ class Drive:
         known, around = near(memory.known, self.model.place(state), self.neighbours, self.range)
         return self._looked_at(state, memory._replace(known=known), around)
 
+    def ended(self, state: Any, memory: Memory, targets: Array) -> tuple[Report, Array]:
+        """The report with the present state, and (N,) who is stuck; can be traced."""
+        return self.observed(state, memory).report, ~self.arrived(state, targets) & (memory.waited > PATIENCE)
+
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
         """Who has not arrived, and came no nearer to the target for `PATIENCE`, by index."""
-        underway = jnp.linalg.norm(targets - self.model.place(state), axis=1) >= self._tolerance()
-        return np.flatnonzero(np.asarray(underway & (memory.waited > PATIENCE))).tolist()
+        return np.flatnonzero(np.asarray(~self.arrived(state, targets) & (memory.waited > PATIENCE))).tolist()
 
     def arrived(self, state: Any, targets: Array) -> Array:
         """(N,) who is within `tolerance` of its target."""
