@@ -271,7 +271,7 @@ class OneProcess:
         self._large = world.everyone.agents > LARGE
         self._protocol, self.world, self._chosen = protocol, world, Chosen.of(choice)
         self._capacity = -(-CHUNK // choice.every) + 1
-        self._ways = None if world.drive is None or not world.drive.map.count else Ways(world.drive)
+        self._ways = None if world.drive is None or not world.drive.map.count else Ways(world.drive, CHUNK)
 
     def start(self) -> tuple[Now, Chunk]:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)

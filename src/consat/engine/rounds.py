@@ -27,6 +27,7 @@ from consat.problem.units import Scale
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending, Trace
+from consat.robots.conditions import conditions
 from consat.robots.drive import Drive, Report
 
 ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
@@ -404,17 +405,20 @@ def known_of(tally: Tally) -> Literal["satisfied", "infeasible"] | None:
 
 
 def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
-    """Of ``run --json`` what is said of robots: distances, m, contacts, and who is stuck."""
+    """Of ``run --json`` what is said of robots: distances, m, contacts, who is stuck, and which conditions for that nobody
+    touches did not hold."""
     if world.drive is None or now.robots is None:
-        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": []}
+        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": [], "unproven": []}
     drive, robots = world.drive, now.robots
     report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
+    noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
     gap, clear = float(report.smallest_distance), float(report.clearance)
     return {
         "smallest_distance": gap if np.isfinite(gap) else None,
         "clearance": clear if np.isfinite(clear) else None,
         "contacts": int(report.contacts),
-        "stuck": [team.ids[i] for i in np.flatnonzero(stuck)],
+        "stuck": [team.ids[i] for i in np.flatnonzero(stuck).tolist()],
+        "unproven": list(conditions(drive, noise=noise, wind=wind, report=report)),
     }
 
 
