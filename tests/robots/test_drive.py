@@ -160,3 +160,18 @@ def test_one_robot_alone_and_none_in_range_are_no_special_cases() -> None:
     assert bool(drive.arrived(state, jnp.asarray([[1.0, 0.0]])).all())
     assert np.isinf(float(memory.report.smallest_distance))
     assert np.isinf(float(memory.report.clearance))
+
+
+@pytest.mark.parametrize("model", [Point(), Double(), Unicycle(), Quadrotor()], ids=lambda model: type(model).__name__.lower())
+def test_what_is_carried_has_the_same_types_before_and_after_a_step(model: Any) -> None:
+    drive, place = Drive(model, 3, 2, DT, [disc([5, 5], 1)]), jnp.asarray(circle(3, 1.0))
+
+    def begun(place: Any) -> Any:
+        state = model.start(place)
+        return state, drive.start(state)
+
+    before = jax.eval_shape(begun, place)
+    after = jax.eval_shape(lambda state, memory: drive.step(state, memory, -place)[:2], *before)
+    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True):
+        kinds = [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in (one, other)]
+        assert kinds[0] == kinds[1], f"{jax.tree_util.keystr(path)}: the program of a run would be compiled twice"

@@ -222,6 +222,8 @@ def test_conditions_that_do_not_hold_are_named() -> None:
     assert first(Drive(Double(), 2, 2, DT, noise=0.01), apart) == "noise"
     moving = fine.start(fine.model.start(apart)).report._replace(strayed=jnp.asarray(0.02))
     assert first(fine, apart, report=moving) == "tube"
+    near_to_each_other = fine.start(fine.model.start(apart)).report._replace(overlap=jnp.asarray(0.02))
+    assert conditions(fine, report=near_to_each_other)[0].startswith("distance: robots, or one and an obstacle, were 0.02 m nearer")
     double = Drive(Double(), 2, 2, DT)
     state = double.model.start(apart)._replace(velocity=jnp.ones((2, 2)))
     assert conditions(double, state) == ("start: robots must be at rest",)

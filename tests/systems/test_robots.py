@@ -33,6 +33,7 @@ def test_all_arrive_and_nobody_touches(crossing: cs.Result) -> None:
     assert motion["smallest_distance"] > 0
     assert motion["clearance"] > 0
     assert motion["stuck"] == []
+    assert motion["unproven"] == []
     assert motion["satisfied_share_after"] == 1.0
     assert summary["robots"]["kind"] == "unicycle"  # type: ignore[index]
     assert summary["obstacles"] == [{"kind": "disc", "center": [0.0, 0.0], "radius": 0.25}]
@@ -52,6 +53,15 @@ def test_what_is_told_is_what_happened(crossing: cs.Result) -> None:
     assert step[:, 1].max() <= 0.4 + 1e-9
     assert np.abs(np.diff(np.unwrap(heading, axis=0), axis=0)).max() * 20 <= 3.6 + 1e-9
     np.testing.assert_allclose(crossing.data["agent_margin"].values[-1], cs.margins(cs.loads(CROSSING).team, position[-1]), atol=1e-12)
+
+
+def test_conditions_of_the_theorem_that_do_not_hold_are_told() -> None:
+    """Wind moves points, which no command asked for, and somebody who is put down on top of another is nearer than the filter keeps."""
+    team = cs.Team([cs.Agent(f"a{k}", [cs.within([float(k), 0], 0.3)], start=[float(k), 1.0]) for k in range(2)])
+    session = cs.Session(team, robots=cs.Point(radius=0.1), rate=20, wind=(0.1, 0)).step(2)
+    assert [each.split(":")[0] for each in session.result().summary["motion"]["unproven"]] == ["wind"]  # type: ignore[index]
+    session.place("a1", [0.05, 1.0]).step(2)
+    assert [each.split(":")[0] for each in session.result().summary["motion"]["unproven"]] == ["wind", "distance"]  # type: ignore[index]
 
 
 def test_a_saved_result_keeps_headings(crossing: cs.Result, tmp_path: object) -> None:

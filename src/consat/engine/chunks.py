@@ -277,7 +277,7 @@ class OneProcess:
         if world.drive is not None and world.drive.map.count:
             from consat.engine.ways import Ways
 
-            self._ways = Ways(world.drive)
+            self._ways = Ways(world.drive, CHUNK)
 
     def start(self) -> tuple[Now, Chunk]:
         first, key = jnp.asarray(self._first), jax.random.key(self._seed)

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from jax import Array
 
 from consat.engine import Stop
 from consat.engine.checkpoint import Checkpoint, fingerprint
@@ -19,13 +20,15 @@ from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
 from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Now, Weather, World, world_of
 from consat.engine.violations import shares
-from consat.numerics import float64
+from consat.numerics import float64, quick_compilation
 from consat.problem.objective import Nu
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending, Trace
+from consat.robots.conditions import conditions
+from consat.robots.drive import Drive, Report
 
 ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
 """What all must know for a run to end, for each stop rule."""
@@ -402,19 +405,27 @@ def known_of(tally: Tally) -> Literal["satisfied", "infeasible"] | None:
 
 
 def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
-    """Of ``run --json`` what is said of robots: distances, m, contacts, and who is stuck."""
+    """Of ``run --json`` what is said of robots: distances, m, contacts, who is stuck, and which conditions for that nobody
+    touches did not hold."""
     if world.drive is None or now.robots is None:
-        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": []}
+        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": [], "unproven": []}
     drive, robots = world.drive, now.robots
-    report = drive.observed(robots.state, robots.memory).report
+    report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
+    noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
     gap, clear = float(report.smallest_distance), float(report.clearance)
-    stuck = drive.stuck(robots.state, robots.memory, now.state.x[world.own])
     return {
         "smallest_distance": gap if np.isfinite(gap) else None,
         "clearance": clear if np.isfinite(clear) else None,
         "contacts": int(report.contacts),
-        "stuck": [team.ids[i] for i in stuck],
+        "stuck": [team.ids[i] for i in np.flatnonzero(stuck).tolist()],
+        "unproven": list(conditions(drive, noise=noise, wind=wind, report=report)),
     }
+
+
+@functools.cache
+def _ended() -> Callable[..., tuple[Report, Array]]:
+    """`Drive.ended` as one program: op by op it is sixty."""
+    return jax.jit(Drive.ended, static_argnums=0, compiler_options=quick_compilation())
 
 
 def _known(tally: Tally) -> Mapping[str, Any]:

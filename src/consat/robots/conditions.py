@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -14,13 +15,13 @@ from consat.robots.drive import Drive, Report, longest_halt
 
 @float64
 def conditions(
-    drive: Drive, state: Any, *, noise: float = 0.0, wind: float = 0.0, paused: float = 0.0, report: Report | None = None
+    drive: Drive, state: Any = None, *, noise: float = 0.0, wind: float = 0.0, paused: float = 0.0, report: Report | None = None
 ) -> tuple[str, ...]:
     """The conditions of the theorem that do not hold, one sentence each; empty where nothing can touch.
 
     Args:
         drive: the robot layer.
-        state: of the robots at the start.
+        state: of the robots at the start; None of those that began at rest, and of which the report tells how near they were.
         noise: the most that a measured position is wrong by, m.
         wind: speed of the air, m/s.
         paused: the longest that a command was held beyond `drive.dt`, s.
@@ -40,15 +41,25 @@ def conditions(
     least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(longest_halt(model, count, dt)) + 2.0 * drive.noise)
     if drive.sensing is not None and drive.sensing < least:
         broken.append(f"sensing: the range is {drive.sensing:g} m, but must be {least:.4g} m")
-    place = model.place(state)
-    if model.inertial and bool(jnp.any(jnp.linalg.norm(model.stop(state, dt) - place, axis=1) > 0.0)):
-        broken.append("start: robots must be at rest")
-    touching = _overlaps(drive, np.asarray(place))
-    if touching:
-        broken.append(f"start: {touching}")
-    if report is not None and float(report.strayed) > 0.0:
-        broken.append(f"tube: a body was {float(report.strayed):.3g} m farther from its reference than the filter allows for")
-    return tuple(broken)
+    if state is not None:
+        place = model.place(state)
+        if model.inertial and bool(jnp.any(jnp.linalg.norm(model.stop(state, dt) - place, axis=1) > 0.0)):
+            broken.append("start: robots must be at rest")
+        touching = _overlaps(drive, np.asarray(place))
+        if touching:
+            broken.append(f"start: {touching}")
+    return tuple(broken) + (() if report is None else tuple(_told(report)))
+
+
+def _told(report: Report) -> Iterator[str]:
+    """What a run's report says of conditions that did not hold."""
+    if float(report.overlap) > 0.0:
+        yield (
+            f"distance: robots, or one and an obstacle, were {float(report.overlap):.3g} m nearer to each other than the filter keeps, "
+            "at the start or after something else went wrong"
+        )
+    if float(report.strayed) > 0.0:
+        yield f"tube: a body was {float(report.strayed):.3g} m farther from its reference than the filter allows for"
 
 
 def _drifts(drive: Drive, wind: float) -> bool:

@@ -67,6 +67,7 @@ class Report(NamedTuple):
         collisions: how many times a robot touched an obstacle, in steps.
         halted: (N,) how many steps each robot was halted by the filter.
         strayed: the farthest that a body was from where the filter took it to be, beyond what it allows for, m.
+        overlap: the most that two robots, or one and an obstacle, were nearer to each other than the filter keeps, m.
     """
 
     smallest_distance: Array
@@ -75,6 +76,7 @@ class Report(NamedTuple):
     collisions: Array
     halted: Array
     strayed: Array
+    overlap: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,24 +143,29 @@ class Drive:
         object.__setattr__(self, "range", look)
         object.__setattr__(self, "explained", 4.0 * added)
 
+    @property
+    def arrives(self) -> Array:
+        """(N,) how near to its target each has arrived, m."""
+        return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
+
     def start(self, state: Any) -> Memory:
-        """The memory at the start."""
+        """The memory at the start, of the types that it has after a step: a weak type would have programs compiled once more."""
         place = self.model.place(state)
-        zeros, none = jnp.zeros(self.count), jnp.asarray(jnp.inf)
+        zeros, never = jnp.zeros(self.count), jnp.full(self.count, jnp.inf, dtype=jnp.float64)
         pairs = self.count if self.count <= PAIRS_COUNTED else 0
-        report = Report(none, none, jnp.asarray(0), jnp.asarray(0), jnp.zeros(self.count, dtype=jnp.int64), jnp.asarray(0.0))
-        memory = Memory(
+        nothing, none = jnp.full((), jnp.inf, dtype=jnp.float64), jnp.zeros((), dtype=jnp.int64)
+        report = Report(nothing, nothing, none, none, jnp.zeros(self.count, dtype=jnp.int64), jnp.zeros(()), jnp.zeros(()))
+        return Memory(
             jnp.zeros_like(place),
             zeros,
             jnp.zeros(self.count, dtype=jnp.int64),
             jnp.full_like(place, LARGEST),
-            jnp.full(self.count, jnp.inf),
+            never,
             zeros,
             candidates(place),
             jnp.zeros((pairs, pairs), dtype=bool),
             report,
         )
-        return self.observed(state, memory)
 
     def step(
         self,
@@ -199,17 +206,16 @@ class Drive:
             everything = everything._replace(least=everything.least + along(everything.normals, true - place))
 
         waypoint, ahead, left = self._way(memory.waypoint, place, targets, paths)
-        underway = jnp.linalg.norm(targets - place, axis=1) >= self._tolerance()
+        underway = jnp.linalg.norm(targets - place, axis=1) >= self.arrives
         pace = model.approach(left, dt)
         seen = deadlock.sight(planes, place, size, memory.velocity, underway, around)
-        straight = safety.open_way(model, state, ahead * pace[:, None], everything, dt)
         wish = deadlock.bent(self.rules, ahead, pace, top, underway=underway, blocked=memory.blocked, seen=seen)
+        command, moves, straight = safety.steered(model, state, wish, ahead * pace[:, None], everything, dt)
         blocked = deadlock.refused(self.rules, memory.blocked, ahead, pace, straight, underway=underway, dt=dt)
-        command, moves = safety.filtered(model, state, wish, everything, dt)
         after = model.step(state, command, dt, wind)
 
-        anew = jnp.linalg.norm(targets - memory.goal, axis=1) > self._tolerance()
-        nearer = left < memory.least - 0.1 * self._tolerance()
+        anew = jnp.linalg.norm(targets - memory.goal, axis=1) > self.arrives
+        nearer = left < memory.least - 0.1 * self.arrives
         memory = memory._replace(
             velocity=model.velocity(state, command),
             blocked=blocked,
@@ -227,17 +233,17 @@ class Drive:
         known, around = near(memory.known, self.model.place(state), self.neighbours, self.range)
         return self._looked_at(state, memory._replace(known=known), around)
 
+    def ended(self, state: Any, memory: Memory, targets: Array) -> tuple[Report, Array]:
+        """The report with the present state, and (N,) who is stuck; can be traced."""
+        return self.observed(state, memory).report, ~self.arrived(state, targets) & (memory.waited > PATIENCE)
+
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
         """Who has not arrived, and came no nearer to the target for `PATIENCE`, by index."""
-        underway = jnp.linalg.norm(targets - self.model.place(state), axis=1) >= self._tolerance()
-        return np.flatnonzero(np.asarray(underway & (memory.waited > PATIENCE))).tolist()
+        return np.flatnonzero(np.asarray(~self.arrived(state, targets) & (memory.waited > PATIENCE))).tolist()
 
     def arrived(self, state: Any, targets: Array) -> Array:
         """(N,) who is within `tolerance` of its target."""
-        return jnp.linalg.norm(targets - self.model.place(state), axis=1) < self._tolerance()
-
-    def _tolerance(self) -> Array:
-        return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
+        return jnp.linalg.norm(targets - self.model.place(state), axis=1) < self.arrives
 
     def _way(self, waypoint: Array, place: Array, targets: Array, paths: Array | None) -> tuple[Array, Array, Array]:
         """The next waypoint (N,), the unit vector to it (N, d), and the length of the way that is left (N,), m.
@@ -265,14 +271,19 @@ class Drive:
         """The report brought up to date with where bodies are, given who is near."""
         body, place = self.model.body(state), self.model.place(state)
         radius, report = each(self.model.radius, self.count), memory.report
-        stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - self.model.size(self.count, self.dt))
-        report = report._replace(strayed=jnp.maximum(report.strayed, stray))
+        kept = self.model.size(self.count, self.dt)
+        stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - kept)
+        overlap = report.overlap
         if self.map.count:
             clear = self.map.signed_distance(body) - radius
+            overlap = jnp.maximum(overlap, jnp.max(kept - self.map.signed_distance(place)))
             report = report._replace(
                 clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + jnp.sum(clear < 0.0)
             )
         index = jnp.minimum(around.who, self.count - 1)
+        within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
+        overlap = jnp.maximum(overlap, jnp.max(jnp.where(around.who < self.count, within, 0.0), initial=0.0))
+        report = report._replace(strayed=jnp.maximum(report.strayed, stray), overlap=overlap)
         gap = jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index]
         gap = jnp.where(around.who < self.count, gap, jnp.inf)
         touching = gap < 0.0

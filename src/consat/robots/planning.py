@@ -25,6 +25,8 @@ CORNERS = 2
 """Corners of a quarter circle that stands for that of a grown obstacle."""
 CELLS = 40_000
 """Of the grid in space, at most."""
+TOUCH = 0.999
+"""Part of the size within which nothing may be on a straight way: a robot that slides along a wall, at its size from it, sees its way."""
 SAMPLES = 128
 """Of a straight way in space, or a multiple of it."""
 
@@ -61,6 +63,10 @@ class Planner:
         width = 1 << max(max(map(len, found), default=1) - 1, 0).bit_length()
         return np.stack([np.concatenate([path, np.repeat(path[-1:], width - len(path), axis=0)]) for path in found])
 
+    def seen(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """(N,) which straight ways, from (N, d) to (N, d), lead past all obstacles."""
+        return self._roads.seen(starts, goals)
+
     def stale(self, paths: np.ndarray, goals: np.ndarray, tolerance: float) -> bool:
         """Whether a goal has moved from where its path ends by more than `tolerance`, m."""
         return bool(np.any(np.linalg.norm(paths[:, -1] - goals, axis=1) > tolerance))
@@ -76,7 +82,7 @@ class _Roads:
         shapes += [shapely.box(*low, *high) for low, high in zip(obstacles.lows, obstacles.highs, strict=True)]
         shapes += [shapely.Polygon(obstacles.begins[first:last]) for first, last in obstacles.polygons]
         solid = shapely.union_all(shapes)
-        self.walls = shapely.buffer(solid, size, quad_segs=16)
+        self.walls = shapely.buffer(solid, TOUCH * size, quad_segs=16)
         # Chords of few corners cut into the circle that they stand for: from farther out they don't.
         reach = (size + clearance) / math.cos(math.pi / (4 * CORNERS))
         grown = shapely.buffer(solid, reach, quad_segs=CORNERS).simplify(0.1 * clearance)
@@ -97,6 +103,10 @@ class _Roads:
         if len(first) == 0:
             return np.zeros(0, dtype=bool)
         return ~shapely.intersects(self.walls, shapely.linestrings(np.stack([first, second], axis=1)))
+
+    def seen(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        outside = [[self._outside(point) for point in points] for points in (starts, goals)]
+        return self._clear(*(np.reshape(points, (-1, 2)) for points in outside))
 
     def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
         start_out, goal_out = self._outside(start), self._outside(goal)
@@ -187,6 +197,9 @@ class _Grid:
         samples = SAMPLES * math.ceil((length / (0.25 * self.size) + 1.0) / SAMPLES)  # few sizes, so that few programs are compiled
         part = np.linspace(0.0, 1.0, samples)[:, None]
         return bool(np.all(self._distance(first + part * (second - first)) > 1.1 * self.size))
+
+    def seen(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        return np.array([self._clear(start, goal) for start, goal in zip(starts, goals, strict=True)], dtype=bool)
 
     def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
         if len(self.nodes) == 0 or self._clear(start, goal):
