@@ -110,10 +110,10 @@ def _facts(result: Result) -> Iterator[tuple[str, str]]:
             f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
         )
     since = summary["satisfied_from"]
-    if since["round"] is not None:
-        yield "satisfied from", f"round {since['round']:.0f}"
-    elif since["time"] is not None:
+    if since["time"] is not None:
         yield "satisfied from", f"t = {number(since['time'])} s"
+    elif since["round"] is not None:
+        yield "satisfied from", f"round {since['round']:.0f}"
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
     for name, count in (("rounds", summary["rounds"]), ("messages", summary["messages"])):
         if count is not None:
