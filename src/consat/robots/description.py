@@ -54,6 +54,13 @@ class Robots:
         own = {agent: model_data(model) for agent, model in self.own.items()}
         return {"robots": model_data(self.common), "obstacles": [obstacle_data(each) for each in self.obstacles], "own": own}
 
+    @property
+    def told(self) -> dict[str, Any]:
+        """As ``run --json`` has it: as `data`, with the robots of their own in ``robots.own``, if there are any."""
+        data = self.data
+        own = {"own": data["own"]} if data["own"] else {}
+        return {"robots": data["robots"] | own, "obstacles": data["obstacles"]}
+
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Robots:
         """From `data`."""

@@ -223,7 +223,7 @@ def _run(
         summary |= {"route": "tree", "why": over}
     summary["warnings"] += around_loops(summary["route"], trace)
     machines = keep.asked.robots
-    summary |= {"robots": None, "obstacles": None} if machines is None else {key: machines.data[key] for key in ("robots", "obstacles")}
+    summary |= {"robots": None, "obstacles": None} if machines is None else machines.told
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)

@@ -420,7 +420,7 @@ class Session:
         scenario = dataclasses.replace(scenario_of(team), name=self._name)
         summary = summarise(scenario, ready.settings, ready.schedule, ready.size, trace, full=False)
         robots = self._options.robots
-        summary |= {"robots": None, "obstacles": None} if robots is None else {key: robots.data[key] for key in ("robots", "obstacles")}
+        summary |= {"robots": None, "obstacles": None} if robots is None else robots.told
         return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
     def __repr__(self) -> str:

@@ -22,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from consat.numerics import float64
 from consat.problem.family import Family
@@ -36,6 +37,12 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = ("o", "s", "^", "D", "v", "<", ">")
 STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
 GREY = "0.45"
+VERDICTS: Mapping[str, Mapping[str, Any]] = {
+    "feasible": {"facecolor": "#009E73", "edgecolor": "#009E73"},
+    "infeasible": {"facecolor": "#D55E00", "edgecolor": "white", "hatch": "xxx"},
+    "undecided": {"facecolor": "0.85", "edgecolor": "0.45", "hatch": "..."},
+}
+"""The looks of verdicts over time; they differ in hatching, too."""
 DPI = 150
 BATCH = 8192
 FAR = 6.0
@@ -119,7 +126,7 @@ def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray 
     It holds the formation, its regions, and the paths unless they come from far. Where `team` is None, the regions are those within
     `boxes` (B, 2, p).
     """
-    everywhere, core = paths.reshape(-1, paths.shape[2]), paths[-1]
+    everywhere, core = paths[np.isfinite(paths).all(axis=2)], paths[-1]  # who joined later was nowhere before
     middle = (core.min(axis=0) + core.max(axis=0)) / 2
     half = max(float(np.ptp(core, axis=0).max()), 1e-3 * float(np.ptp(everywhere, axis=0).max())) or 1e-3
     count = 0 if team is None else len(team.owner)
@@ -174,20 +181,22 @@ def margins(result: Result) -> Figure:
     """The margin β̄, from when on every constraint holds, and between what the best margin is proven to lie; and the bound that the agents
     themselves have proven, where they do, else the smooth margin β."""
     data, summary = recorded(result), result.summary
-    figure, axes, clock = _chart(result, "margin of the team", "margin")
+    figure, axes, clock = _chart(result, "margin of the team", "margin", timed=True)
+    along = seconds(result, data[str(data["margin"].dims[0])].values.astype(float)) if clock == "time" else data[clock].values
     axes.axhline(0.0, color="black", linewidth=0.8)
     proves = "bound" in data and np.isfinite(data["bound"].values).any()
     curves = [("margin", r"margin $\barβ$", 0), *([] if proves else [("smooth_margin", r"smooth margin $β$", 1)])]
     for name, label, k in curves:
         curve = data[name].where(np.isfinite(data[name]))
         dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
-        axes.plot(data[clock], curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
+        axes.plot(along, curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
     if proves:
         bound = data["bound"].where(np.isfinite(data["bound"]))
-        axes.plot(data[clock], bound, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
+        axes.plot(along, bound, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
     axes.margins(y=0.08)
     _stretch(axes, *(data[name].values for name, *_ in curves))
-    lower, upper = summary.get("bounds") or (None, None)
+    verdicts = summary.get("verdicts")
+    lower, upper = (summary.get("bounds") or (None, None)) if not verdicts else (None, None)  # of a team that moves they hold at the end
     if lower is not None and upper is not None:
         proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
         axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
@@ -197,21 +206,40 @@ def margins(result: Result) -> Figure:
         label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
         late = since > np.mean(axes.get_xlim())
         axes.text(since, 0.06, f" {label} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    entries = [*axes.get_legend_handles_labels()[0], *(_band(axes, verdicts) if verdicts else ())]
+    figure.legend(handles=entries, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
-def _chart(result: Result, title: str, ylabel: str) -> tuple[Figure, Axes, str]:
-    """A figure, its axes over the time, or the rounds, of a run, and which of the two."""
+def _chart(result: Result, title: str, ylabel: str, *, timed: bool = False) -> tuple[Figure, Axes, str]:
+    """A figure, its axes over the time, or the rounds, of a run, and which of the two; timed: the time wherever rounds take some."""
     figure = Figure(figsize=(8.4, 4.8), layout="constrained")
     axes = figure.add_subplot(title=f"{plain(result.summary['scenario'])}: {title}", ylabel=ylabel)
     clock = str(result.data["margin"].dims[0])
-    first, last = result.data[clock].values[[0, -1]]
+    first, last = result.data[clock].values[[0, -1]].astype(float)
+    if timed and period(result) is not None:
+        clock, (first, last) = "time", seconds(result, np.array([first, last]))
     axes.set(xlabel="time t [s]" if clock == "time" else "round", xlim=(first, last if last > first else first + 1))
     axes.locator_params("x", integer=clock == "round")
     axes.grid(color="0.92", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes, clock
+
+
+def _band(axes: Axes, verdicts: Sequence[Mapping[str, Any]]) -> list[Patch]:
+    """Draw verdicts over time as a band under a chart, each named where there is room; returns what the legend says of them."""
+    band = axes.inset_axes((0.0, -0.26, 1.0, 0.07), sharex=axes)
+    first, last = axes.get_xlim()
+    for each in verdicts:
+        verdict, start, stop = str(each["verdict"]), float(each["from"]), float(each["to"])
+        band.axvspan(start, stop, **VERDICTS[verdict], linewidth=0, gid=f"verdict {verdict}")
+        if stop - start > 0.014 * len(verdict) * (last - first):
+            around = {"facecolor": "white", "linewidth": 0, "pad": 1.5}
+            band.text((start + stop) / 2, 0.48, verdict, ha="center", va="center", fontsize=8, bbox=around)
+    band.set(yticks=[], xlim=(first, last), ylim=(0, 1))
+    band.tick_params(bottom=False, labelbottom=False)
+    seen = {str(each["verdict"]) for each in verdicts}
+    return [Patch(**look, linewidth=0, label=f"the constraints: {verdict}") for verdict, look in VERDICTS.items() if verdict in seen]
 
 
 def _stretch(axes: Axes, *curves: np.ndarray) -> None:
@@ -232,10 +260,16 @@ def _stretch(axes: Axes, *curves: np.ndarray) -> None:
 
 
 def seconds(result: Result, steps: np.ndarray) -> np.ndarray:
-    """The times, s, of recorded steps; of rounds that take no time, or of which nobody says, their numbers."""
-    verdicts = result.summary.get("verdicts")
-    last = float(result.data["margin"].coords[result.data["margin"].dims[0]].values[-1])
-    return steps * (float(verdicts[-1]["to"]) / last if verdicts and last > 0 else 1.0)
+    """The times, s, of recorded steps; of rounds that take no time their numbers."""
+    return steps * (period(result) or 1.0)
+
+
+def period(result: Result) -> float | None:
+    """How long a step of the record's clock lasts, s; None if nobody says, as of rounds that take no time."""
+    clock = str(result.data["margin"].dims[0])
+    last, motion, verdicts = float(result.data[clock].values[-1]), result.summary.get("motion"), result.summary.get("verdicts")
+    duration = motion["duration"] if motion else verdicts[-1]["to"] if verdicts else None
+    return 1.0 if clock == "time" else None if duration is None or not last > 0 else float(duration) / last
 
 
 def label(what: str, unit: str | None) -> str:

@@ -9,9 +9,10 @@
   const AGENTS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"];
   const AGENTS_DARK = ["#4FB0EE", "#FF8F50", "#31D1A0", "#E8A3CC", "#F5BF45", "#9AD8FA", "#F0F0F0"];
   const FEW = 12, MOST_SEGMENTS = 30000, SPEEDS = [0.25, 0.5, 1, 2, 4];
+  const VERDICTS = { feasible: "#009E73", infeasible: "#D55E00", undecided: "#9aa0a8" };
   const THEMES = {
-    light: { paper: "#ffffff", ink: "#1c2430", grid: "#e8ebef", axis: "#6b7480", link: "#4d5663", trail: "#dccaa4", bar: "#4a4a4a", area: "#0072B2", agents: AGENTS },
-    dark: { paper: "#12171e", ink: "#e8ecf1", grid: "#252d37", axis: "#93a0ae", link: "#9aa7b5", trail: "#6b5f45", bar: "#b9bfc7", area: "#56B4E9", agents: AGENTS_DARK },
+    light: { paper: "#ffffff", ink: "#1c2430", grid: "#e8ebef", axis: "#6b7480", link: "#4d5663", trail: "#dccaa4", bar: "#4a4a4a", area: "#0072B2", solid: "#9e9e9e", edge: "#404040", agents: AGENTS },
+    dark: { paper: "#12171e", ink: "#e8ecf1", grid: "#252d37", axis: "#93a0ae", link: "#9aa7b5", trail: "#6b5f45", bar: "#b9bfc7", area: "#56B4E9", solid: "#5d636b", edge: "#c3c8ce", agents: AGENTS_DARK },
   };
 
   // ---- data
@@ -27,6 +28,7 @@
     const scene = { ...data, x: floats(data.x), steps: floats(data.steps), margin: floats(data.margin), agentMargin: floats(data.agent_margin) };
     scene.links = new Int32Array(bytes(data.links));
     scene.bound = data.bound === null ? null : floats(data.bound);
+    scene.heading = data.bodies && data.bodies.heading ? floats(data.bodies.heading) : null;
     scene.count = data.ids.length;
     scene.samples = scene.steps.length;
     scene.few = scene.count <= FEW;
@@ -39,8 +41,16 @@
     const a = Math.floor(at), b = Math.min(a + 1, scene.samples - 1), share = at - a, size = count * d;
     const where = new Float32Array(size);
     for (let k = 0; k < size; k += 1) where[k] = (1 - share) * x[a * size + k] + share * x[b * size + k];
+    let heading = null;
+    if (scene.heading) { // the shorter way round
+      heading = new Float32Array(count);
+      for (let i = 0; i < count; i += 1) {
+        const first = scene.heading[a * count + i], turn = scene.heading[b * count + i] - first;
+        heading[i] = first + share * Math.atan2(Math.sin(turn), Math.cos(turn));
+      }
+    }
     return {
-      moment: at, sample: a, where,
+      moment: at, sample: a, where, heading,
       step: (1 - share) * scene.steps[a] + share * scene.steps[b],
       margins: scene.agentMargin.subarray(a * count, (a + 1) * count),
       margin: scene.margin[a],
@@ -204,6 +214,37 @@
       pen.stroke(); pen.globalAlpha = 1;
     }
 
+    // What stands in the way: solid, as nothing else is. In space a box is drawn side by side, the farthest first.
+    function drawObstacle(obstacle) {
+      pen.fillStyle = theme.solid; pen.strokeStyle = theme.edge; pen.lineWidth = 1.2;
+      const close = (points) => { pen.beginPath(); points.forEach(([px, py], k) => (k ? pen.lineTo(px, py) : pen.moveTo(px, py))); pen.closePath(); pen.fill(); pen.stroke(); };
+      if (obstacle.kind === "disc") {
+        const [px, py] = project(obstacle.center[0], obstacle.center[1], obstacle.center[2] || 0);
+        pen.beginPath(); pen.arc(px, py, scale * obstacle.radius, 0, 2 * Math.PI); pen.fill(); pen.stroke();
+        return;
+      }
+      if (obstacle.kind === "polygon") { close(obstacle.vertices.map(([x, y]) => project(x, y, 0))); return; }
+      const ends = [obstacle.low, obstacle.high], at = (k) => project(ends[k >> 2 & 1][0], ends[k >> 1 & 1][1], scene.space ? ends[k & 1][2] : 0);
+      if (!scene.space) { close([0, 4, 6, 2].map(at)); return; }
+      const sides = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]].map((side) => side.map(at));
+      const depth = (side) => side.reduce((sum, corner) => sum + corner[2], 0);
+      sides.sort((one, other) => depth(other) - depth(one)).forEach(close);
+    }
+
+    // The bodies of robots: their true size, and a stroke to where they look.
+    function drawBodies(frame) {
+      const { radius, offset } = scene.bodies, turns = frame.heading !== null;
+      for (let i = 0; i < scene.count; i += 1) {
+        const ahead = turns ? [Math.cos(frame.heading[i]), Math.sin(frame.heading[i])] : [0, 0];
+        const x = frame.where[i * d] - offset[i] * ahead[0], y = (d > 1 ? frame.where[i * d + 1] : 0) - offset[i] * ahead[1];
+        const [px, py] = project(x, y, d > 2 ? frame.where[i * d + 2] : 0), r = scale * radius[i];
+        pen.fillStyle = scene.few ? agentColour(i) : shadeOf(scene, frame.margins[i]); pen.strokeStyle = theme.edge;
+        pen.globalAlpha = scene.few ? 0.6 : 0.95; pen.lineWidth = 1;
+        pen.beginPath(); pen.arc(px, py, r, 0, 2 * Math.PI); pen.fill(); pen.globalAlpha = 1; pen.stroke();
+        if (turns && offset[i] > 0) { pen.lineWidth = 1.6; pen.beginPath(); pen.moveTo(px, py); pen.lineTo(px + r * ahead[0], py - r * ahead[1]); pen.stroke(); }
+      }
+    }
+
     function drawGrid() {
       const lo = scene.space ? low : [center[0] - width / 2 / scale, center[1] - height / 2 / scale];
       const hi = scene.space ? high : [center[0] + width / 2 / scale, center[1] + height / 2 / scale];
@@ -273,7 +314,7 @@
     }
 
     function drawAgents(frame) {
-      const radius = scene.count <= FEW ? 6 : scene.count < 60 ? 5 : scene.count < 300 ? 4 : 3, places = [], groups = new Map();
+      const radius = scene.bodies ? 2.5 : scene.count <= FEW ? 6 : scene.count < 60 ? 5 : scene.count < 300 ? 4 : 3, places = [], groups = new Map();
       for (let i = 0; i < scene.count; i += 1) {
         places.push(place(frame, i));
         const colour = scene.few ? agentColour(i) : shadeOf(scene, frame.margins[i]);
@@ -326,6 +367,7 @@
       pen.fillStyle = theme.paper; pen.fillRect(0, 0, width, height);
       drawGrid();
       if (scene.space) drawAxes();
+      (scene.obstacles || []).forEach(drawObstacle);
       if (show.regions) {
         scene.walls.forEach(drawWall);
         if (!scene.few && !scene.space) drawUnion(frame);
@@ -336,6 +378,7 @@
       for (const ball of scene.balls) if (ball.owners.includes(show.chosen)) drawBall(frame, ball, true);
       if (show.trails) drawTrails(frame);
       if (show.links) drawLinks(frame);
+      if (scene.bodies) drawBodies(frame);
       drawAgents(frame);
     }
 
@@ -396,6 +439,9 @@
           drawnAt.push(y);
           pen.strokeStyle = v === 0 ? theme.ink : theme.grid; pen.beginPath(); pen.moveTo(46, y); pen.lineTo(width - 10, y); pen.stroke();
           pen.fillText(String(Number(v.toPrecision(1))).replace("-", "−"), 42, y + 4);
+        }
+        for (const [from, to, verdict] of scene.verdicts || []) { // a band: can the constraints all hold
+          pen.fillStyle = VERDICTS[verdict]; pen.fillRect(px(from), height - 20, Math.max(1, px(to) - px(from)), 4); pen.fillStyle = theme.axis;
         }
         pen.textAlign = "center"; pen.fillText(scene.clock === "time" ? "time [s]" : "round", width / 2, height - 4);
         pen.textAlign = "left"; pen.fillText(String(Number(first.toPrecision(4))), 46, height - 4);

@@ -24,9 +24,10 @@ from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views import space, words
+from consat.robots.description import obstacle_data
+from consat.views import bodies, space, words
 from consat.views.colours import classes
-from consat.views.figures import number, recorded, seconds, view
+from consat.views.figures import number, period, recorded, seconds, view
 from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Balls, Walls, boxes, moves, shapes, ways
 
@@ -109,14 +110,15 @@ def _facts(result: Result) -> Iterator[tuple[str, str]]:
             f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
         )
     since = summary["satisfied_from"]
-    if since["round"] is not None:
-        yield "satisfied from", f"round {since['round']:.0f}"
-    elif since["time"] is not None:
+    if since["time"] is not None:
         yield "satisfied from", f"t = {number(since['time'])} s"
+    elif since["round"] is not None:
+        yield "satisfied from", f"round {since['round']:.0f}"
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
     for name, count in (("rounds", summary["rounds"]), ("messages", summary["messages"])):
         if count is not None:
             yield name, f"{count:,}"
+    yield from words.motion(summary)
     for reason in result.reasons:
         yield "in the way", reason
 
@@ -147,10 +149,12 @@ def document(result: Result) -> dict[str, Any]:
     """What the page knows, as JSON can hold it (schema consat.replay/1).
 
     ``x`` is (T, N, d) with d at most 3, ``agent_margin`` (T, N), ``margin`` and ``steps`` (T,); ``links`` (L, 2) int32; ``balls``,
-    ``walls`` and ``outlines`` are the regions; ``spread`` are moments, in samples, evenly spread along what happens.
+    ``walls`` and ``outlines`` are the regions; ``obstacles`` as a scenario has them, ``bodies`` of robots; ``spread`` are moments, in
+    samples, evenly spread along what happens.
     """
     data, summary, team = recorded(result), result.summary, None if "final_position" in result.data else result.team
     clock = str(data["position"].dims[0])
+    shown = "time" if period(result) is not None else clock
     x = data["position"].values[:, :, :3]
     finite = np.flatnonzero(np.isfinite(x).all(axis=(1, 2)))
     last = int(finite[-1]) if len(finite) else 0
@@ -158,20 +162,23 @@ def document(result: Result) -> dict[str, Any]:
     x = x[chosen]
     dimension = x.shape[2]
     times = seconds(result, data[clock].values[chosen].astype(float))
-    low, high, found = _regions(team, x, times)
-    margin, agent_margin, steps = (data[name].values[chosen] for name in ("margin", "agent_margin", clock))
+    stand = bodies.obstacles(result)
+    low, high, found = _regions(team, x, times, bodies.bounds(stand, dimension) if dimension > 1 else None)
+    margin, agent_margin = (data[name].values[chosen] for name in ("margin", "agent_margin"))
+    steps = times if shown == "time" else data[clock].values[chosen]
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
-    since = summary["satisfied_from"]["time" if clock == "time" else "round"]
+    since = summary["satisfied_from"]["time" if shown == "time" else "round"]
     return {
         "schema": SCHEMA,
         "name": summary["scenario"],
         "unit": None if team is None else team.unit,
-        "clock": clock,
+        "clock": shown,
         "dimension": dimension,
         "ids": [str(name) for name in data["agent"].values],
         "verdict": summary["verdict"],
-        "bounds": summary.get("bounds"),
+        "bounds": None if summary.get("verdicts") else summary.get("bounds"),
+        "verdicts": [[each["from"], each["to"], each["verdict"]] for each in summary.get("verdicts") or ()],
         "since": since,
         "steps": _packed(steps),
         "x": _packed(np.nan_to_num(x)),
@@ -183,8 +190,20 @@ def document(result: Result) -> dict[str, Any]:
         "high": [round(float(value), 6) for value in high],
         "spread": [round(float(value), 3) for value in _spread(x, steps)],
         "scale": {"edges": edges, "shades": shades},
+        "bodies": _bodies(result, data, chosen),
+        "obstacles": [obstacle_data(each) for each in stand],
         **found,
     }
+
+
+def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | None:
+    """Sizes, and headings (T, N) where there are any; None for points."""
+    found = bodies.bodies(result, data)
+    if found is None:
+        return None
+    turns = found.heading is not None and bool(found.turns.any())
+    heading = _packed(np.nan_to_num(found.heading[chosen])) if found.heading is not None and turns else None
+    return {"radius": found.radius.tolist(), "offset": found.offset.tolist(), "heading": heading}
 
 
 def _steps(x: np.ndarray) -> np.ndarray:
@@ -203,14 +222,17 @@ def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray
     return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
 
 
-def _regions(team: Team | None, x: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
-    """The box to show, low and high, and the regions."""
+def _regions(
+    team: Team | None, x: np.ndarray, times: np.ndarray, stand: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
+    """The box to show, low and high, and the regions; `stand`, (B, 2, d), are boxes around obstacles."""
     dimension = x.shape[2]
     if team is None or len(team.owner) > MOST_SHAPES:
-        low, high, _ = view(x, x[-1], None)
+        low, high, _ = view(x, x[-1], None, stand)
         return low, high, {"balls": [], "walls": [], "outlines": []}
     geometry = shapes(team, times[-1])
     balls, around = geometry.balls, [boxes(team)[:, :, :dimension], ways(team, times)[:, :, :dimension]]
+    around += [] if stand is None else [stand]
     if team.dimension <= 3:
         center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
         fixed = np.concatenate([center - radius, center + radius], axis=1)

@@ -19,10 +19,10 @@ from matplotlib.patheffects import withStroke
 
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views import areas, space
+from consat.views import areas, bodies, space
 from consat.views.areas import SHARED, Area, Ground
 from consat.views.colours import AREA, LINK, TRAIL, classes
-from consat.views.figures import GREY, colour, grid, label, marker, number, plain, recorded, regions, seconds, view
+from consat.views.figures import GREY, colour, grid, label, marker, number, period, plain, recorded, regions, seconds, view
 from consat.views.shapes import Shapes, boxes, moves, shapes, ways
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
@@ -31,6 +31,8 @@ MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40
 GRID = 241
 """Points along each side of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
+MOST_MAP = 2.0
+"""Obstacles that are this many times larger than what the agents travel are cut by the view."""
 MOST_TIGHTEST, MOST_ASKED = 3, 20
 """Of a crowd so many of the worst violated agents have their names written, where there is room."""
 
@@ -75,6 +77,8 @@ class Scene:
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
         self.last = int(finite[-1]) if len(finite) else 0
         self._times = seconds(result, self.steps.astype(float))
+        if period(result) is not None:  # then people think in seconds
+            self._clock, self.steps = "time", self._times
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
@@ -89,6 +93,9 @@ class Scene:
         self._ground: Ground | None = None
         self._shapes: Shapes | None = None
         self._lawn: list[Artist] = []
+        seen = self.x.shape[2] in (2, 3)
+        self._crew: bodies.Crew | None = None
+        self._robots, self._map = (bodies.bodies(result, data), bodies.obstacles(result)) if seen else (None, ())
         if self._team is not None and (self._space or not self._few):
             self._shapes = shapes(self._team, self._times[self.last])
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
@@ -97,7 +104,7 @@ class Scene:
             height = max(5.2, 0.6 + 0.235 * rows)  # at low resolutions letters are taller
             self.figure.set_size_inches(1.5 + (height - 0.8) * ratio + 0.08 * letters, height + 0.6 * (not self._few))
         if self._space:
-            list(self._bodies(self.x[self.last], self.last, moving=False))
+            list(self._in_space(self.x[self.last], self.last, moving=False))
         else:
             self._cast()
 
@@ -114,7 +121,8 @@ class Scene:
         axes, team, x = self.axes, self._team, self.x[self.last]
         axis_count = 3 if self._space else 2
         seen = self._then(self.last) if self._few else None
-        low, high, self._cut = view(self.x[: self.last + 1, :, :axis_count], x, seen, self._boxes(x, axis_count))
+        paths = self.x[: self.last + 1, :, :axis_count]
+        low, high, self._cut = view(paths, x, seen, self._boxes(x, axis_count))
         self._along, self._points = grid(low, high, 2 if self._space else self._fine)
         labels = [label(f"position {name}", unit) for name in names]
         if self._line:
@@ -131,6 +139,7 @@ class Scene:
         axes.set_axisbelow(True)
         if self._space:
             axes.computed_zorder = False  # agents are seen through regions
+        (bodies.map_in_space if self._space else bodies.map_in_plane)(axes, self._map)
         if team is not None:
             self._settle(team, x)
         points = 330.0 * self._trail(self.last)[-1, :, :2] / self._unit
@@ -140,14 +149,22 @@ class Scene:
     def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray | None:
         """(B, 2, p) around the regions that the view has to hold besides what `view` finds."""
         if self._team is None:
-            return None
-        found = [boxes(self._team)[:, :, :axes], ways(self._team, self._times[: self.last + 1])[:, :, :axes]]
+            return self._near(axes)
+        found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self._times[: self.last + 1])[:, :, :axes]]
         if not self._few and self._shapes is not None and not self._line:
             balls = self._shapes.balls
             fixed = balls.around < 0
             center, radius = balls.at(x)[fixed, None, :axes], balls.radius[fixed, None, None]
             found.append(np.concatenate([center - radius, center + radius], axis=1))
         return np.concatenate(found)
+
+    def _near(self, axes: int) -> np.ndarray:
+        """(B, 2, p) around the obstacles that are not much larger than what the agents travel."""
+        if not self._map:
+            return np.zeros((0, 2, min(axes, self.x.shape[2])))
+        around, paths = bodies.bounds(self._map, axes), self.x[: self.last + 1, :, :axes]
+        way = float((np.nanmax(paths, axis=(0, 1)) - np.nanmin(paths, axis=(0, 1))).max())
+        return around[np.ptp(around, axis=1).max(axis=1) <= MOST_MAP * way]
 
     def _settle(self, team: Any, x: np.ndarray) -> None:
         """The regions: those of a few agents follow at every `show`, those of a crowd that stay where they are stand here."""
@@ -221,6 +238,8 @@ class Scene:
         bar.ax.set_yticklabels([number(edge) for edge in edges])
         line = functools.partial(Line2D, [], [])
         lines: list[Any] = [line(marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")]
+        if self._robots is not None:
+            lines.clear()  # bodies are agents
         if self.x.shape[1] <= MOST_LINES:
             lines.append(line(color=TRAIL, linewidth=2, marker="o", markerfacecolor="white", markersize=4, label="start and path"))
         if len(self._links):
@@ -229,6 +248,7 @@ class Scene:
             drawn = [bool(self._shapes.balls.keeps_out[k]) for k in space.chosen(self._shapes)]
             self._kinds = {"goal": drawn.count(False), "bar": drawn.count(True)}
             lines.append(line(color=space.FLOOR, marker=".", linestyle=":", label="shadow on the floor"))
+        lines += bodies.legend(self._robots, self._map)
         kinds = getattr(self, "_kinds", {})
         if kinds.get("goal"):
             lines.append(Patch(facecolor=(*AREA, 0.12), edgecolor=(*AREA, 0.7), label="region to be in"))
@@ -247,6 +267,7 @@ class Scene:
         lines.append(line(color=GREY, marker="o", markerfacecolor="white", linestyle="", label="start"))
         if len(self._links) and not self._line:
             lines.append(line(color=LINK, linewidth=1, linestyle=DOTS, label="communication link"))
+        lines += bodies.legend(self._robots, self._map)
         if self._space:
             lines.append(line(color=space.FLOOR, marker=".", linestyle=":", label="shadow on the floor"))
         if team is not None and self._areas:
@@ -294,18 +315,25 @@ class Scene:
             every = range(self.x.shape[1])
             self._paths = [axes.plot([], [], **_path(i))[0] for i in every]
             starts = [axes.plot(*trail[0, i, :, None], **_start(i))[0] for i in every]
-            self._heads = [axes.plot([], [], **_head(i))[0] for i in every]
+            self._heads = [axes.plot([], [], **self._head(i))[0] for i in every]
+            self._crew = None if self._robots is None else bodies.Crew(axes, self._robots, [colour(i) for i in every])
             for i, name in enumerate(self._ids):
                 x, y = self._where[i]
                 place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
-                self._names.append(axes.annotate(name, trail[0, i], (7 * x, 7 * y), textcoords="offset points", **_ink(i), **place))
-            self.moving = [*ground, self._wires, *self._paths, *starts, *self._heads, *self._names]
+                far = 7.0 if self._robots is None else max(7.0, 3 + 330 * (self._robots.radius[i] + self._robots.offset[i]) / self._unit[0])
+                self._names.append(axes.annotate(name, trail[0, i], (far * x, far * y), textcoords="offset points", **_ink(i), **place))
+            crew = [] if self._crew is None else self._crew.artists
+            self.moving = [*ground, self._wires, *self._paths, *starts, *crew, *self._heads, *self._names]
             return
         count = trail.shape[1]
         self._paths = [axes.plot([], [], color=TRAIL, linewidth=1.0, zorder=1, gid="path")[0]]
         if count <= MOST_LINES:
             size = 3.5 if count < 200 else 1.5
             axes.plot(*trail[0].T, "o", color=TRAIL, markerfacecolor="white", markersize=size, zorder=1.2, gid="start")
+        if self._robots is not None:
+            self._crew = bodies.Crew(axes, self._robots, None)
+            self.moving = [self._paths[0], self._wires, *self._crew.artists]
+            return
         self._dots = axes.scatter(*trail[-1].T, **_dots(count))
         self.moving = [self._paths[0], self._wires, self._dots]
 
@@ -315,9 +343,12 @@ class Scene:
         if self._space:
             for artist in self.moving:
                 artist.remove()
-            bodies = self._bodies(_between(self.x, moment)[0], moment, moving=True)
-            self.moving = [*bodies, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
+            regions = self._in_space(_between(self.x, moment)[0], moment, moving=True)
+            self.moving = [*regions, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
             self.moving += self._agents(trail) if self._few else self._crowd(trail, sample)
+            if self._robots is not None and self._few:
+                shades = [colour(i) for i in range(self.x.shape[1])]
+                self.moving += bodies.balls(self.axes, trail[-1], self._robots.radius, shades)
             style: dict[str, Any] = {"color": LINK, "linewidth": 1 if self._few else 0.6, "linestyle": DOTS, "gid": "link"}
             self.moving += self.axes.plot(*_joined(trail[-1][self._links]), **style)
         else:
@@ -334,6 +365,8 @@ class Scene:
             self._wires.set_data(*_joined(trail[-1][self._links]))
         if self._ground is not None:
             self._move_ground(self._ground, moment)
+        if self._crew is not None:
+            self._crew.show(trail[-1], moment)
         if not self._few:
             self._move_crowd(trail, moment)
             return
@@ -366,8 +399,11 @@ class Scene:
             self._lawn = self._plain(shapes(self._team, self._time(moment)), _between(self.x, moment)[0], moment)
             self.moving += self._lawn
         margins = self._agent_margin[int(moment)]
-        self._dots.set_offsets(trail[-1])
-        self._dots.set_facecolor(self._shades(margins))
+        if self._crew is not None:
+            self._crew.paint(self._shades(margins))
+        else:
+            self._dots.set_offsets(trail[-1])
+            self._dots.set_facecolor(self._shades(margins))
         for name in self._names:
             name.remove()
             self.moving.remove(name)
@@ -386,7 +422,7 @@ class Scene:
     def _shades(self, margins: np.ndarray) -> Any:
         return self._colours.to_rgba(np.ma.masked_invalid(margins))
 
-    def _bodies(self, x: np.ndarray, moment: float, *, moving: bool) -> Iterator[Artist]:
+    def _in_space(self, x: np.ndarray, moment: float, *, moving: bool) -> Iterator[Artist]:
         """Regions in space with the team at x (N, d): those that move, or those that stay."""
         team = self._then(moment)
         if self._team is None or team is None or self._shapes is None:
@@ -405,8 +441,12 @@ class Scene:
         for i, name in enumerate(self._ids):
             yield from self.axes.plot(*trail[:, i].T, **_path(i))
             yield from self.axes.plot(*trail[0, i, :, None], **_start(i))
-            yield from self.axes.plot(*trail[-1, i, :, None], **_head(i))
+            yield from self.axes.plot(*trail[-1, i, :, None], **self._head(i))
             yield self.axes.text(*trail[-1, i], f"  {name}", **_ink(i))
+
+    def _head(self, agent: int) -> dict[str, Any]:
+        """The look of a few agents' recorded positions; within a body it is a dot."""
+        return _head(agent) | ({} if self._robots is None else {"markersize": 3.5, "marker": "o", "markeredgewidth": 0.6})
 
     def _crowd(self, trail: np.ndarray, sample: int) -> Iterator[Artist]:
         """Many agents in space, coloured by margin."""
@@ -463,6 +503,6 @@ def _joined(segments: np.ndarray) -> np.ndarray:
 def moments(scene: Scene, count: int, movement: float) -> np.ndarray:
     """(count,) moments from start to end: by a share of `movement` evenly along the way travelled, for the rest by the clock."""
     x, clock = scene.x[: scene.last + 1], scene.steps[: scene.last + 1] - float(scene.steps[0])
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(x, axis=0), axis=(1, 2))))
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
     share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
     return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))

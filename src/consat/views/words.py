@@ -11,6 +11,7 @@ from consat.errors import counted
 MOST_AGENTS = 10
 """Of how many agents every position is listed; of more, only those with the smallest margins are named."""
 MOST_BINDING, MOST_VIOLATED, MOST_AXES, MOST_LETTERS = 5, 3, 6, 24
+MOST_INTERVALS, MOST_STUCK = 6, 10
 SLIGHT = 0.01
 """Constraints with a smaller multiplier don't bind."""
 
@@ -47,6 +48,7 @@ def summary(summary: Mapping[str, Any], reasons: Sequence[str] = ()) -> str:
     lines = [f"{summary['scenario']}: {status}" + (f"; {ending}" if ending and summary["status"] != "diverged" else "")]
     for name, value in (
         *_outcome(summary),
+        *motion(summary),
         *_effort(summary),
         *_who(summary),
         *(("in the way", text) for text in reasons),
@@ -100,6 +102,51 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _when(summary: Mapping[str, Any]) -> str:
     since = summary["known_from"]
     return f"round {since:.0f}" if summary.get("rounds") is not None else f"t = {_number(since)} s"
+
+
+def motion(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What is said of teams that move, and of robots."""
+    if summary.get("verdicts"):
+        yield "over time", over_time(summary)
+        yield "kept up", kept_up(summary)
+    if summary.get("robots"):
+        yield "bodies", bodies(summary)
+
+
+def over_time(summary: Mapping[str, Any]) -> str:
+    """When the constraints of a team that moves can all hold; what is undecided only where it is long."""
+    verdicts = summary["verdicts"]
+    duration = verdicts[-1]["to"]
+    told = [each for each in verdicts if each["verdict"] != "undecided" or each["to"] - each["from"] >= SLIGHT * duration]
+    spans = [f"{each['verdict']} from {_number(each['from'])} to {_number(each['to'])} s" for each in told[:MOST_INTERVALS]]
+    left = len(told) - len(spans)
+    return "; ".join(spans) + (f"; and {left} more intervals" if left else "")
+
+
+def kept_up(summary: Mapping[str, Any]) -> str:
+    """For how much of the time every constraint of a team that moves held."""
+    motion = summary["motion"]
+    share = motion["satisfied_share_after"]
+    if share is None:
+        return "never: at no time did every constraint hold"
+    duration, rounds = motion["duration"], summary["rounds"]
+    later = motion["satisfied_share"] / share  # both count the same rounds
+    before = (1 - later) * (rounds + 1) / max(rounds, 1) * duration
+    told = "at all times" if share == 1 else f"for {math.floor(1000 * share) / 10:g} % of the time"
+    return f"every constraint held {told} after t = {_number(before)} s; worst margin {_number(motion['worst_margin_after'])}"
+
+
+def bodies(summary: Mapping[str, Any]) -> str:
+    """How near robots came to each other and to obstacles, and who did not get on."""
+    motion = summary["motion"]
+    gap, clear, contacts = (motion[key] for key in ("smallest_distance", "clearance", "contacts"))
+    told = ["nobody touched" if not contacts else counted(contacts, "pair", "pairs") + " touched"]
+    near = [f"{_number(gap)} m apart at least"] if gap is not None else []
+    near += [f"{_number(clear)} m from obstacles"] if clear is not None else []
+    told += [", ".join(near)] if near else []
+    stuck = [_short(agent) for agent in motion["stuck"]]
+    more = f", and {len(stuck) - MOST_STUCK} more" if len(stuck) > MOST_STUCK else ""
+    return "; ".join([*told, *([f"stuck: {', '.join(stuck[:MOST_STUCK])}{more}"] if stuck else [])])
 
 
 def _way(summary: Mapping[str, Any], way: Mapping[str, Any]) -> str:

@@ -1,0 +1,202 @@
+"""Robots and obstacles as they are drawn: bodies of true size that look where they look, and what stands in their way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from consat.results.result import Result
+from consat.robots.description import Robots
+from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
+
+SOLID: Final = "0.62"
+"""The colour of obstacles: solid grey, as nothing else is; keep-outs are hatched."""
+EDGE: Final = "0.25"
+AROUND: Final = np.linspace(0, 2 * np.pi, 25)
+SIDES: Final = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
+"""Of a box in space the corners of each side; corner k is high on the axes whose bit of k, the first axis' first, is set."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """The bodies of the recorded agents.
+
+    Attributes:
+        radius: (N,).
+        offset: (N,) how far a body's middle is behind the recorded position, along its heading.
+        heading: (T, N) which way they look, rad; None where no heading was recorded.
+        turns: (N,) whether the heading means anything.
+    """
+
+    radius: np.ndarray
+    offset: np.ndarray
+    heading: np.ndarray | None
+    turns: np.ndarray
+
+    def middle(self, x: np.ndarray, ahead: np.ndarray | None) -> np.ndarray:
+        """(…, N, d) the middles of bodies.
+
+        Args:
+            x: (…, N, d) recorded positions.
+            ahead: (…, N, 2) unit vectors, as `ahead` gives them.
+        """
+        if ahead is None:
+            return x
+        behind = np.zeros_like(x)
+        behind[..., :2] = self.offset[:, None] * ahead
+        return x - behind
+
+    def ahead(self, moment: float) -> np.ndarray | None:
+        """(N, 2) unit vectors along the headings at a moment, between two samples the shorter way round."""
+        if self.heading is None:
+            return None
+        first, last = self.heading[int(moment)], self.heading[int(np.ceil(moment))]
+        angle = first + (moment % 1) * (np.mod(last - first + np.pi, 2 * np.pi) - np.pi)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def machines(result: Result) -> Robots | None:
+    """The robots and the obstacles of a run, as its summary has them; None if its agents were points."""
+    told = result.summary.get("robots")
+    if told is None:
+        return None
+    common = {key: value for key, value in told.items() if key != "own"}
+    return Robots.of({"robots": common, "obstacles": result.summary.get("obstacles") or [], "own": told.get("own", {})})
+
+
+def bodies(result: Result, data: Any) -> Bodies | None:
+    """The bodies of the agents in a record, an `xarray.Dataset` of the result."""
+    known = machines(result)
+    if known is None:
+        return None
+    models = [known.own.get(str(agent), known.common) for agent in data["agent"].values]
+    radius, offset = (
+        np.array([float(np.max(getattr(model, name, 0.0))) for model in models], dtype=float) for name in ("radius", "offset")
+    )
+    heading = data["heading"].values if "heading" in data else None
+    return Bodies(radius, offset, heading, offset > 0)
+
+
+def obstacles(result: Result) -> tuple[Obstacle, ...]:
+    """The obstacles of a run."""
+    known = machines(result)
+    return () if known is None else known.obstacles
+
+
+def bounds(found: Sequence[Obstacle], axes: int) -> np.ndarray:
+    """(B, 2, axes) the boxes around obstacles."""
+    boxes = [np.stack(_bounds(each))[:, :axes] for each in found]
+    return np.stack(boxes) if boxes else np.zeros((0, 2, axes))
+
+
+def _bounds(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray]:
+    if isinstance(obstacle, Disc):
+        return np.array(obstacle.center) - obstacle.radius, np.array(obstacle.center) + obstacle.radius
+    if isinstance(obstacle, Box):
+        return np.array(obstacle.low), np.array(obstacle.high)
+    assert isinstance(obstacle, Polygon)
+    return np.min(obstacle.vertices, axis=0), np.max(obstacle.vertices, axis=0)
+
+
+def outline(obstacle: Obstacle) -> Path:
+    """An obstacle in the plane."""
+    if isinstance(obstacle, Disc):
+        return Path.circle((obstacle.center[0], obstacle.center[1]), obstacle.radius)
+    if isinstance(obstacle, Box):
+        (left, bottom), (right, top) = obstacle.low, obstacle.high
+        corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    else:
+        assert isinstance(obstacle, Polygon)
+        corners = list(obstacle.vertices)
+    return Path([*corners, corners[0]], closed=True)
+
+
+def map_in_plane(axes: Any, found: Sequence[Obstacle]) -> None:
+    """Draw obstacles: solid grey."""
+    for each in found:
+        axes.add_artist(PathPatch(outline(each), facecolor=SOLID, edgecolor=EDGE, linewidth=1.2, zorder=0.9, gid="obstacle"))
+
+
+def map_in_space(axes: Any, found: Sequence[Obstacle]) -> None:
+    """Draw balls and boxes: solid grey."""
+    for each in found:
+        if isinstance(each, Disc):
+            axes.plot_surface(*_ball(np.array(each.center), each.radius), color=SOLID, alpha=0.9, linewidth=0, zorder=1, gid="obstacle")
+        elif isinstance(each, Box):
+            sides = np.array(np.meshgrid(*zip(each.low, each.high, strict=True), indexing="ij")).reshape(3, 8).T[SIDES]
+            look: dict[str, Any] = {"facecolors": [to_rgba(SOLID, 0.85)], "edgecolors": [EDGE], "linewidths": 0.8}
+            axes.add_collection3d(Poly3DCollection(sides, **look, gid="obstacle", zorder=1), autolim=False)
+
+
+def balls(axes: Any, middle: np.ndarray, radius: np.ndarray, shades: Sequence[Any]) -> list[Artist]:
+    """Bodies in space, (N, 3), as balls."""
+    return [
+        axes.plot_surface(*_ball(at, size), color=shade, linewidth=0, zorder=4, gid="body")
+        for at, size, shade in zip(middle, radius, shades, strict=True)
+    ]
+
+
+def _ball(center: np.ndarray, radius: float) -> np.ndarray:
+    """(3, K, L) points on a sphere."""
+    longitude, latitude = np.meshgrid(AROUND, AROUND[: len(AROUND) // 2 + 1], indexing="ij")
+    sphere = np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
+    return np.asarray(center[:, None, None] + radius * sphere)
+
+
+class Crew:
+    """Bodies in the plane as artists: discs, and a stroke from the middle of each to where it looks.
+
+    Args:
+        axes: to draw on.
+        found: the bodies.
+        shades: (N,) their colours; None if `paint` tells.
+    """
+
+    def __init__(self, axes: Any, found: Bodies, shades: Sequence[Any] | None) -> None:
+        self._found = found
+        size = 2 * found.radius
+        look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0, "zorder": 4.5}
+        offsets = np.zeros((len(size), 2))
+        self._discs = EllipseCollection(size, size, offsets=offsets, edgecolors=EDGE, linewidths=0.8, gid="body", **look)
+        axes.add_collection(self._discs, autolim=False)
+        self._strokes = Line2D([], [], color=EDGE, linewidth=1.4, solid_capstyle="butt", zorder=4.6, gid="heading")
+        axes.add_artist(self._strokes)
+        if shades is not None:
+            self._discs.set_facecolor([to_rgba(shade, 0.65) for shade in shades])
+        self.artists: list[Artist] = [self._discs, self._strokes]
+
+    def paint(self, shades: Any) -> None:
+        """Give every body its colour."""
+        self._discs.set_facecolor(shades)
+
+    def show(self, x: np.ndarray, moment: float) -> None:
+        """Put the bodies where they are at a moment; x: (N, 2) the recorded positions then."""
+        found, ahead = self._found, self._found.ahead(moment)
+        middle = found.middle(x, ahead)
+        self._discs.set_offsets(middle)
+        if ahead is not None and found.turns.any():
+            tips = middle + found.radius[:, None] * ahead
+            ends = np.stack([middle, tips, np.full_like(tips, np.nan)], axis=1)[found.turns]
+            self._strokes.set_data(*ends.reshape(-1, 2).T)
+
+
+def legend(found: Bodies | None, stand: Sequence[Obstacle]) -> list[Any]:
+    """What the legend says of robots and obstacles."""
+    entries: list[Any] = []
+    if found is not None:
+        style: dict[str, Any] = {"marker": "o", "markersize": 11, "markerfacecolor": "0.85", "markeredgecolor": EDGE, "linestyle": ""}
+        words = "body, and where it looks" if found.turns.any() else "body"
+        entries.append(Line2D([], [], **style, label=words))
+    if stand:
+        entries.append(Patch(facecolor=SOLID, edgecolor=EDGE, label="obstacle"))
+    return entries
