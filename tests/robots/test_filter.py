@@ -75,7 +75,9 @@ def hunted(model: Any, dimension: int, *, dt: float = DT, share: float = 1.0, se
     count, rng = 24, np.random.default_rng(seed)
     size = model.size(count, dt) + margin(model, count, dt, 0.0, share)
     top = float(jnp.max(model.pace(count)))
-    state = model.start(jnp.asarray(packed(rng, np.asarray(size), dimension, side=3.2 * float(jnp.max(size)) * count ** (1 / dimension) / 2)))
+    state = model.start(
+        jnp.asarray(packed(rng, np.asarray(size), dimension, side=3.2 * float(jnp.max(size)) * count ** (1 / dimension) / 2))
+    )
     known = candidates(model.place(state))
 
     @jax.jit

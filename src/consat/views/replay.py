@@ -1,7 +1,7 @@
 """A run as one HTML file that replays it offline: nothing is loaded, nothing is evaluated, everything lies inside.
 
-``replay.html`` is the page, ``replay.css`` its look, ``replay.js`` decodes the data and draws. The data is JSON; arrays are base64 of
-little-endian float32.
+``replay.html`` is the page, ``page.css`` its look, ``page.js`` decodes the data and draws; that is built from ``web/``, and the live page
+has it too. The data is JSON; arrays are base64 of little-endian float32.
 """
 
 from __future__ import annotations
@@ -24,21 +24,19 @@ from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views import space, words
+from consat.views import picture, words
 from consat.views.colours import classes
-from consat.views.figures import number, recorded, view
+from consat.views.figures import number, recorded
 from consat.views.outlines import MOST, outlines
-from consat.views.shapes import boxes, moves, shapes
+from consat.views.picture import FEW, MOST_SHAPES
+from consat.views.shapes import moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
 """Of a longer record some steps are replayed, evenly spread along what happens."""
-MOST_SHAPES: Final = 20_000
 MOST_OUTLINED: Final = 40
 """Moments at which the boundaries of moving regions are traced."""
 SPREAD: Final = 200
-FEW: Final = 12
-"""Up to so many agents have colours of their own, as in ``replay.js``."""
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> Path:
@@ -63,7 +61,7 @@ def page(result: Result) -> str:
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
     files = resources.files("consat.views")
-    style, script, html = ((files / f"replay.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "page.js", "replay.html"))
     data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     summary = result.summary
     status = summary["status"]
@@ -204,40 +202,17 @@ def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray
 
 def _regions(team: Team | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
     """The box to show, low and high, and the regions."""
-    dimension = x.shape[2]
+    low, high = picture.frame(team, x)
     if team is None or len(team.owner) > MOST_SHAPES:
-        low, high, _ = view(x, x[-1], None)
         return low, high, {"balls": [], "walls": [], "outlines": []}
-    geometry = shapes(team)
-    balls, around = geometry.balls, [boxes(team)[:, :, :dimension]]
-    if team.dimension <= 3:
-        center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
-        fixed = np.concatenate([center - radius, center + radius], axis=1)
-        around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
-    low, high, _ = view(x, x[-1], None, np.concatenate(around))
-    told: list[Mapping[str, Any]] = [
-        {
-            "center": balls.center[k].tolist(),
-            "around": int(balls.around[k]),
-            "radius": float(balls.radius[k]),
-            "out": bool(balls.keeps_out[k]),
-            "owners": list(balls.owners[k]),
-        }
-        for k in range(len(balls.radius))
-        if team.dimension <= 3
-    ]
-    return low, high, {"balls": told, "walls": _walls(team, low, high), "outlines": _outlines(team, geometry.others, x, low, high)}
-
-
-def _walls(team: Team, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
-    """Half-spaces as polygons within the view, of a team in the plane as lines; those of a box are cut by each other."""
-    if team.dimension not in (2, 3):
-        return []
-    walls, beyond = shapes(team).walls, 10 * (high - low) * (team.dimension == 2)  # a reader may pan
-    return [
-        {"corners": np.round(corners, 6).tolist(), "normal": walls.normal[k].tolist(), "owners": list(walls.owners[k])}
-        for k, corners in space.faces(walls, low - beyond, high + beyond)
-    ]
+    found = shapes(team)
+    balls, walls = picture.constraints_of(team, found)
+    told: dict[str, list[Mapping[str, Any]]] = {
+        "balls": [*picture.balls_of(team, found, balls)],
+        "walls": picture.walls_of(team, found.walls, walls, low, high),
+        "outlines": _outlines(team, found.others, x, low, high),
+    }
+    return low, high, told
 
 
 def _outlines(team: Team, numbers: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
