@@ -666,10 +666,11 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       return scale;
     },
     set(next: Scene) {
+      const fresh = scene.count === 0;
       scene = next;
       d = scene.dimension;
       dots = new Map();
-      if (!fitted) fit();
+      if (fresh) fit();
     },
     where: (i: number): Point | null => (last && i < scene.count ? spot(last.where, i) : null),
     hit: (px: number, py: number, reach: number): Hit | null => (last ? hitTest(targets(), px, py, reach) : null),

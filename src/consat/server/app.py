@@ -165,7 +165,7 @@ class Host:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            raw = message.get("text") if message.get("text") is not None else message.get("bytes") or b""
+            raw: str | bytes = message.get("text") or message.get("bytes") or b""
             if not client.allowance.take():
                 client.answer(_no(f"more than {RATE:g} messages a second; this one was ignored"))
                 continue

@@ -100,6 +100,7 @@ class Simulation:
         self._playing, self._speed, self._owed = True, SPEED, 0
         self._loss, self._protocol = float(settings.get("loss", 0.0)), self._kind()
         self._busy: str | None = None
+        self._cold = True
         self._undos: list[Undo] = []
         self._silent: dict[str, Silent] = {}
         self._cut: list[tuple[str, str]] = []
@@ -172,12 +173,20 @@ class Simulation:
                 if self._owed or (self._playing and now >= due):
                     count = self._owed or max(1, round(self._speed / FRAMES))
                     self._owed = 0
-                    self._session.step(count)
+                    self._step(count)
                     due = max(due + count / self._speed, now - 0.1)
                 self._show_frame()
         finally:
             self._open = False
             self.notify()
+
+    def _step(self, count: int) -> None:
+        if self._cold:
+            self._say_busy("compiling the rounds of the team")
+        self._session.step(count)
+        if self._cold:
+            self._cold, self._busy = False, None
+            self._show_state()
 
     def _wait(self, due: float) -> float:
         """Seconds until the next round is due."""
@@ -210,7 +219,8 @@ class Simulation:
                 return "wall", pending.client, order.gesture, order.scene, order.wall
             case orders.Put() as order:
                 return "place", pending.client, order.gesture, order.agent
-        return None
+            case _:
+                return None
 
     def _answered(self, pending: Pending) -> dict[str, Any]:
         try:
@@ -219,7 +229,7 @@ class Simulation:
             return {"type": "answer", "ok": False, "words": str(error)[:1000]}
         finally:
             if self._busy is not None:
-                self._busy = None
+                self._busy, self._cold = None, True
                 self._show_state()
         return {"type": "answer", "ok": True, "words": "", **found}
 
@@ -227,7 +237,17 @@ class Simulation:
 
     def _do(self, order: Order, client: int) -> dict[str, Any]:
         """Carry out one order. Raises: ConsatError: it cannot be; nothing has changed."""
-        session, gesture = self._session, None if order.gesture is None else (client, order.gesture)
+        if isinstance(order, orders.Plain) and order.do == "text":
+            return {"text": self._text()}
+        gesture = None if order.gesture is None else (client, order.gesture)
+        self._do_constraint(order, gesture)
+        self._do_team(order, gesture)
+        self._do_run(order)
+        self._show_state()
+        return {}
+
+    def _do_constraint(self, order: Order, gesture: tuple[int, int] | None) -> None:
+        session = self._session
         match order:
             case orders.Change():
                 numbers = named(session.team, order.agent, order.constraint)
@@ -236,12 +256,24 @@ class Simulation:
                 self._change_shape(order, gesture)
             case orders.Wall():
                 self._change_wall(order, gesture)
+            case orders.AddConstraint():
+                made = _made(order.constraint)
+                self._structural("one more constraint", lambda: session.add_constraint(order.agent, made))
+            case orders.RemoveConstraint():
+                self._structural("one constraint less", lambda: session.remove_constraint(order.agent, order.constraint))
+            case _:
+                pass
+
+    def _do_team(self, order: Order, gesture: tuple[int, int] | None) -> None:
+        session = self._session
+        match order:
             case orders.Put():
                 self._put(order.agent, order.position, gesture)
             case orders.Add():
-                self._add(order)
+                agent = Agent(order.agent, [_made(each) for each in order.constraints], order.position)
+                self._structural(f"the team with {order.agent}", lambda: session.add(agent, order.links))
             case orders.OfAgent(do="remove"):
-                self._structural(f"without {order.agent}", lambda: session.remove(order.agent))
+                self._structural(f"the team without {order.agent}", lambda: session.remove(order.agent))
             case orders.OfAgent(do="kill"):
                 self._kill(order.agent)
             case orders.OfAgent():
@@ -252,11 +284,11 @@ class Simulation:
             case orders.OfLink():
                 self._structural("laying a link", lambda: session.connect(order.one, order.other))
                 self._cut = [pair for pair in self._cut if set(pair) != {order.one, order.other}]
-            case orders.AddConstraint():
-                made = _made(order.constraint)
-                self._structural("with one more constraint", lambda: session.add_constraint(order.agent, made))
-            case orders.RemoveConstraint():
-                self._structural("with one constraint less", lambda: session.remove_constraint(order.agent, order.constraint))
+            case _:
+                pass
+
+    def _do_run(self, order: Order) -> None:
+        match order:
             case orders.Step():
                 self._owed += order.rounds
             case orders.Speed():
@@ -265,12 +297,10 @@ class Simulation:
                 self._lose(order.share)
             case orders.Protocol():
                 self._follow(order.kind)
-            case orders.Plain(do="text"):
-                return {"text": self._text()}
             case orders.Plain():
                 self._plain(order.do)
-        self._show_state()
-        return {}
+            case _:
+                pass
 
     def _plain(self, word: str) -> None:
         match word:
@@ -282,6 +312,8 @@ class Simulation:
                 before = self._places()
                 self._put_all(self._begun)
                 self._remember(None, lambda: self._put_all(before))
+            case _:
+                pass
 
     def _change(
         self, targets: list[tuple[str, str, list[int]]], parameters: Mapping[str, Any], gesture: tuple[int, int] | None
@@ -360,10 +392,6 @@ class Simulation:
     def _places(self) -> dict[str, np.ndarray]:
         return dict(zip(self._session.team.ids, self._session.positions, strict=True))
 
-    def _add(self, order: orders.Add) -> None:
-        agent = Agent(order.agent, [_made(each) for each in order.constraints], order.position)
-        self._structural(f"with {order.agent}", lambda: self._session.add(agent, order.links))
-
     def _kill(self, name: str) -> None:
         team = self._session.team
         place = self._places()
@@ -379,14 +407,14 @@ class Simulation:
         ]
         links = [next(end for end in pair if end != name) for pair in team.linked if name in pair]
         silent = Silent(dataclasses.replace(own[name], start=place[name]), readers, links)
-        self._structural(f"without {name}", lambda: self._session.remove(name))
+        self._structural(f"the team without {name}", lambda: self._session.remove(name))
         self._silent[name] = silent
 
     def _revive(self, name: str) -> None:
         silent = self._silent.get(name)
         if silent is None:
-            there = ", ".join(self._silent) or "none"
-            raise InvalidTeam([Fault((), f"it was not killed, so it cannot be revived; killed are {there}", f"agent {shown(name)}")])
+            killed = ", ".join(self._silent) or "none"
+            raise InvalidTeam([Fault((), f"it was not killed, so it cannot be revived; killed are {killed}", f"agent {shown(name)}")])
         team = self._session.team
         there = {*team.ids, name}
 
@@ -400,12 +428,12 @@ class Simulation:
         own = [constraint for constraint in flatten(silent.agent.constraints) if fits(constraint)]
         links = [*team.linked, *((name, other) for other in silent.links if other in there)]
         whole = Team([*agents, dataclasses.replace(silent.agent, constraints=own)], links, team.dimension, unit=team.unit)
-        self._structural(f"with {name} again", lambda: self._session.become(whole))
+        self._structural(f"the team with {name} again", lambda: self._session.become(whole))
         del self._silent[name]
 
     def _lose(self, share: float) -> None:
         before = self._loss
-        self._say_busy("with another loss")
+        self._say_busy("other rounds, with another loss")
         self._session.lose(share)
         self._loss = share
 
@@ -421,7 +449,7 @@ class Simulation:
         self._remember(None, lambda: self._begin_anew(before), compiles=True)
 
     def _begin_anew(self, kind: str) -> None:
-        self._say_busy(f"with {kind}")
+        self._say_busy(f"beginning with {kind}")
         scenario = dataclasses.replace(self._scenario, team=self._team_here())
         self._session = Session(scenario, **self._settings | {"protocol": kind, "loss": self._loss})
         self._protocol = self._kind()
@@ -473,7 +501,7 @@ class Simulation:
         last = self._undos.pop()
         count = len(self._undos)
         if last.compiles:
-            self._say_busy("as it was before")
+            self._say_busy("the team as it was")
         last.back()
         del self._undos[count:]
         self._changed()
@@ -546,7 +574,7 @@ class Simulation:
         })  # fmt: skip
 
     def _say_busy(self, what: str) -> None:
-        self._busy = f"compiling the team {what}"
+        self._busy = what
         self._show_state()
 
     def _changed(self) -> None:
