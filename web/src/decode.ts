@@ -43,6 +43,7 @@ export function decode(data: any): Recording {
     obstacles: data.obstacles ?? [],
     silent: [],
     cut: [],
+    hues: data.ids.map((_: string, i: number) => i),
   };
 }
 

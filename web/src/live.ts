@@ -71,6 +71,7 @@ const EMPTY: Scene = {
   low: [-1, -1],
   high: [1, 1],
   scale: { edges: [0], shades: ["#a31a2c", "#1b5a9b"] },
+  hues: [],
 };
 
 export function createLive(root: HTMLElement) {
@@ -97,6 +98,7 @@ export function createLive(root: HTMLElement) {
   let drag: Drag | null = null;
   let adding = false;
   let gestures = Date.now();
+  const hues = new Map<string, number>();
   let fps = 0;
   let dark = preferDark();
   let dirty = true;
@@ -167,6 +169,10 @@ export function createLive(root: HTMLElement) {
         silent: [],
         cut: [],
       };
+      if (scene.few) {
+        for (const id of ids) if (!hues.has(id)) hues.set(id, hues.size);
+        scene.hues = ids.map((id) => hues.get(id)!);
+      }
       number = message.number;
       constraints = message.constraints;
       view.set(scene);
@@ -227,6 +233,7 @@ export function createLive(root: HTMLElement) {
 
   let notedFor = "";
   function say_(text: string, bad: boolean, reason = ""): void {
+    if (reason === "busy" && !note.hidden && note.classList.contains("bad")) return;
     note.textContent = text;
     note.className = bad ? "note bad" : "note";
     note.setAttribute("role", bad ? "alert" : "status");
@@ -411,7 +418,7 @@ export function createLive(root: HTMLElement) {
       delete row.dataset.silent;
       row.dataset.agent = String(who);
       row.setAttribute("aria-pressed", String(view.show.chosen?.kind === "agent" && view.show.chosen.k === who));
-      dot.style.background = scene.few ? theme.agents[who % theme.agents.length] : shadeOf(scene.scale, margin);
+      dot.style.background = scene.few ? theme.agents[(scene.hues[who] ?? who) % theme.agents.length] : shadeOf(scene.scale, margin);
       name.textContent = scene.ids[who];
       tag.textContent = "binds";
       tag.hidden = !(margin <= least + 0.02 * Math.abs(least) + 1e-4);

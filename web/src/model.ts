@@ -64,6 +64,8 @@ export interface Scene {
   low: number[];
   high: number[];
   scale: Scale;
+  /** Which colour each of a few agents has, so that it keeps it when others come and go. */
+  hues: number[];
 }
 
 /** Where everybody was: at(k) has N × d numbers. */

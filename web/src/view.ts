@@ -108,7 +108,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
 
   const spot = (values: ArrayLike<number>, i: number): Point =>
     project(values[i * d], d > 1 ? values[i * d + 1] : 0, d > 2 ? values[i * d + 2] : 0);
-  const agentColour = (i: number) => theme.agents[i % theme.agents.length];
+  const agentColour = (i: number) => theme.agents[(scene.hues[i] ?? i) % theme.agents.length];
   const ownerColour = (owners: number[], out: boolean) =>
     scene.few && owners.length === 1 ? agentColour(owners[0]) : out ? theme.bar : scene.few ? theme.axis : theme.area;
   const isChosen = (owners: number[]) => show.chosen?.kind === "agent" && owners.includes(show.chosen.k);
@@ -360,7 +360,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         pen.moveTo(a[0], a[1]);
         pen.lineTo(b[0], b[1]);
         const text = String(Number(value.toPrecision(6))).replace("-", "−");
-        if (!scene.space) labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
+        if (!scene.space && (axis ? a[1] < height - 22 : a[0] > 4)) labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
       }
     }
     pen.stroke();

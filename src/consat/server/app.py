@@ -25,7 +25,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from consat import __version__
 from consat.errors import InvalidSettings
-from consat.server.orders import parse
+from consat.server.orders import number_of, parse
 from consat.server.simulation import Simulation
 
 MOST_CLIENTS, MOST_ANSWERS = 16, 64
@@ -167,12 +167,12 @@ class Host:
                 return
             raw: str | bytes = message.get("text") or message.get("bytes") or b""
             if not client.allowance.take():
-                client.answer(_no(f"more than {RATE:g} messages a second; this one was ignored"))
+                client.answer(_no(raw, f"more than {RATE:g} messages a second; this one was ignored"))
                 continue
             try:
                 order = parse(raw)
             except InvalidSettings as error:
-                client.answer(_no(str(error)))
+                client.answer(_no(raw, str(error)))
                 continue
             self.simulation.ask(order, client.number, client.answer)
 
@@ -180,21 +180,23 @@ class Host:
         seen: dict[str, int] = {}
         while True:
             client.news.clear()
-            while client.answers:
-                await socket.send_text(client.answers.popleft())
+            ready = len(client.answers)  # what they tell of is among the news by now, and is sent first
             for content in self.simulation.board.news(seen):
                 if isinstance(content, bytes):
                     await socket.send_bytes(content)
                 else:
                     await socket.send_text(content)
+            for _ in range(min(ready, len(client.answers))):
+                await socket.send_text(client.answers.popleft())
             if not self.simulation.alive:
                 await socket.close(1001, "the session has ended")
                 return
-            await client.news.wait()
+            if not client.answers:
+                await client.news.wait()
 
 
-def _no(words: str) -> dict[str, Any]:
-    return {"type": "answer", "id": None, "ok": False, "words": words[:1000]}
+def _no(raw: str | bytes, words: str) -> dict[str, Any]:
+    return {"type": "answer", "id": number_of(raw), "ok": False, "words": words[:1000]}
 
 
 def page(name: str, host: str) -> tuple[str, str]:

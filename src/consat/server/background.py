@@ -38,10 +38,11 @@ class Background(Generic[T]):
             self._change.notify()
 
     def close(self) -> None:
-        """Begin nothing more."""
+        """Begin nothing more, and wait for what has begun."""
         with self._change:
             self._open = False
             self._change.notify()
+        self._thread.join(timeout=60.0)
 
     def _run(self) -> None:
         while True:

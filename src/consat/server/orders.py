@@ -13,6 +13,7 @@ LONGEST: Final = 4096
 MOST_ROUNDS: Final = 1000
 FASTEST: Final = 1000.0
 
+Number: TypeAlias = Annotated[int, Field(ge=0, lt=2**53)] | None
 Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=200)]
 Text: TypeAlias = Annotated[str, Field(max_length=2000)]
 Vector: TypeAlias = Annotated[list[float], Field(min_length=1, max_length=64)]
@@ -28,8 +29,8 @@ class Order(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    id: Annotated[int, Field(ge=0, lt=2**53)] | None = None
-    gesture: Annotated[int, Field(ge=0, lt=2**53)] | None = None
+    id: Number = None
+    gesture: Number = None
 
 
 class Change(Order):
@@ -156,7 +157,7 @@ def parse(raw: str | bytes) -> Order:
     Raises:
         InvalidSettings: says what is wrong with it.
     """
-    content = raw.encode("utf-8", "surrogatepass") if isinstance(raw, str) else raw
+    content = _content(raw)
     if len(content) > LONGEST:
         raise InvalidSettings(f"the message has {len(content):,} bytes, but may have at most {LONGEST:,}")
     try:
@@ -164,6 +165,25 @@ def parse(raw: str | bytes) -> Order:
     except ValidationError as error:
         raise InvalidSettings(_words(error)) from None
     return order
+
+
+class _Numbered(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    id: Number = None
+
+
+def number_of(raw: str | bytes) -> int | None:
+    """The number of a message that is no order, so that its answer can repeat it; None if it has none."""
+    content = _content(raw)
+    try:
+        return None if len(content) > LONGEST else _Numbered.model_validate_json(content).id
+    except ValidationError:
+        return None
+
+
+def _content(raw: str | bytes) -> bytes:
+    return raw.encode("utf-8", "surrogatepass") if isinstance(raw, str) else raw
 
 
 def _words(error: ValidationError) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from consat.errors import ConsatError, Fault, InvalidInput, InvalidTeam, closest, shown
 from consat.numerics import float64
 from consat.problem.constraints import KINDS
-from consat.problem.constraints.record import Constraint, flatten
+from consat.problem.constraints.record import OWNER, Constraint, flatten
 from consat.problem.team import Agent, Team
 from consat.runs.preparation import scenario_of
 from consat.runs.session import Session, assessed
@@ -55,11 +55,13 @@ class Silent(NamedTuple):
     """An agent that was killed, with all that it takes to bring it back.
 
     Attributes:
+        place: in the team.
         agent: with its constraints, where it was.
         readers: ids of others, each with a constraint that read its position.
         links: ids of those it could talk to.
     """
 
+    place: int
     agent: Agent
     readers: list[tuple[str, Constraint]]
     links: list[str]
@@ -135,10 +137,10 @@ class Simulation:
         with self._wake:
             self._open = False
             self._wake.notify()
-        self._assessor.close()
-        self._tracer.close()
         if self._thread.is_alive():
             self._thread.join(timeout=60.0)
+        self._assessor.close()
+        self._tracer.close()
 
     def watch(self, count: int) -> None:
         """Tell how many are watching; nobody's session stands still."""
@@ -229,7 +231,7 @@ class Simulation:
             return {"type": "answer", "ok": False, "words": str(error)[:1000]}
         finally:
             if self._busy is not None:
-                self._busy, self._cold = None, True
+                self._busy = None
                 self._show_state()
         return {"type": "answer", "ok": True, "words": "", **found}
 
@@ -406,7 +408,7 @@ class Simulation:
             if name in constraint.reads
         ]
         links = [next(end for end in pair if end != name) for pair in team.linked if name in pair]
-        silent = Silent(dataclasses.replace(own[name], start=place[name]), readers, links)
+        silent = Silent(list(own).index(name), dataclasses.replace(own[name], start=place[name]), readers, links)
         self._structural(f"the team without {name}", lambda: self._session.remove(name))
         self._silent[name] = silent
 
@@ -419,7 +421,7 @@ class Simulation:
         there = {*team.ids, name}
 
         def fits(constraint: Constraint) -> bool:
-            return all(not isinstance(read, str) or read in there for read in constraint.reads)
+            return all(read == OWNER or read in there for read in constraint.reads)
 
         agents = []
         for each in team.agents:
@@ -427,7 +429,8 @@ class Simulation:
             agents.append(dataclasses.replace(each, constraints=[*flatten(each.constraints), *back]) if back else each)
         own = [constraint for constraint in flatten(silent.agent.constraints) if fits(constraint)]
         links = [*team.linked, *((name, other) for other in silent.links if other in there)]
-        whole = Team([*agents, dataclasses.replace(silent.agent, constraints=own)], links, team.dimension, unit=team.unit)
+        agents.insert(silent.place, dataclasses.replace(silent.agent, constraints=own))
+        whole = Team(agents, links, team.dimension, unit=team.unit)
         self._structural(f"the team with {name} again", lambda: self._session.become(whole))
         del self._silent[name]
 
@@ -435,7 +438,7 @@ class Simulation:
         before = self._loss
         self._say_busy("other rounds, with another loss")
         self._session.lose(share)
-        self._loss = share
+        self._loss, self._cold = share, True
 
         def back() -> None:
             self._session.lose(before)
@@ -453,8 +456,7 @@ class Simulation:
         scenario = dataclasses.replace(self._scenario, team=self._team_here())
         self._session = Session(scenario, **self._settings | {"protocol": kind, "loss": self._loss})
         self._protocol = self._kind()
-        self._scene = self._show_scene(self._scene)
-        self._changed()
+        self._restructured()
 
     def _kind(self) -> str:
         return self._session.protocol
@@ -474,6 +476,7 @@ class Simulation:
         self._restructured()
 
     def _restructured(self) -> None:
+        self._cold = True
         self._scene = self._show_scene(self._scene)
         self._changed()
 
@@ -528,7 +531,7 @@ class Simulation:
         scene, session = self._scene, self._session
         hit = [k for k, own in enumerate(scene.balls) if not numbers.isdisjoint(own)]
         if any(not numbers.issuperset(scene.balls[k]) for k in hit) or len({*self._patches, *hit}) > MOST_PATCHED:
-            self._restructured()
+            self._scene = self._show_scene(scene)
             return
         team = session.team.at(session.time)
         for k in hit:
@@ -539,7 +542,7 @@ class Simulation:
         if any(not numbers.isdisjoint(own) for own in scene.walls):
             moved = scene.moved(team)
             if moved is None:
-                self._restructured()
+                self._scene = self._show_scene(scene)
                 return
             self._scene, self._walls = moved, list(moved.told_walls())
         if self._patches or self._walls is not None:
