@@ -128,7 +128,9 @@ def test_agent_is_killed_and_revived_and_a_link_that_must_stay_is_not_cut(tab: T
 def test_link_is_cut_by_the_mouse_and_healed(tab: Tab) -> None:
     assert tab.evaluate("consat.send({do: 'connect', one: 'a1', other: 'a3'})")["ok"]
     until(tab, "consat.margin > 0.9")
-    tab.evaluate("consat.send({do: 'place', agent: 'a2', position: [0, 0]})")
+    tab.get_by_label("Pause").click()
+    tab.evaluate("consat.send({do: 'place', agent: 'a2', position: [0, 2]})")  # off the line between the others
+    tab.wait_for_timeout(300)
     a1, a3 = (tab.evaluate(f"consat.where('{each}')") for each in ("a1", "a3"))
     free = next(
         [a1[0] + t * (a3[0] - a1[0]), a1[1] + t * (a3[1] - a1[1])]
@@ -139,6 +141,7 @@ def test_link_is_cut_by_the_mouse_and_healed(tab: Tab) -> None:
     tab.get_by_role("button", name="Cut the link between a1 and a3").click()
     tab.get_by_role("button", name="Heal the link between a1 and a3").click()
     tab.get_by_role("button", name="Heal the link between a1 and a3").wait_for(state="detached")
+    tab.get_by_label("Play", exact=True).click()
     assert tab.evaluate("consat.send({do: 'disconnect', one: 'a1', other: 'a3'})")["ok"]
 
 

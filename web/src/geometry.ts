@@ -76,8 +76,8 @@ export function hitTest(targets: Targets, px: number, py: number, reach: number)
   return inside >= 0 ? { kind: "grip", k: inside } : null;
 }
 
-/** Where a disc can be taken by its inside or its middle: the first of some places at which nothing else is in the way. */
-export function gripOf(targets: Targets, k: number, reach: number): Point {
+/** Where a disc can be taken by its inside or its middle: the first of some places at which nothing else is in the way, or null. */
+export function gripOf(targets: Targets, k: number, reach: number): Point | null {
   const disc = targets.discs[k];
   for (const share of [0, 0.45, 0.7, 0.25, 0.85]) {
     for (let turn = 0; turn < (share === 0 ? 1 : 12); turn += 1) {
@@ -87,7 +87,7 @@ export function gripOf(targets: Targets, k: number, reach: number): Point {
       if (hit?.kind === "grip" && hit.k === k) return at;
     }
   }
-  return [disc.x, disc.y];
+  return null;
 }
 
 const overlap = (a: Box, b: Box): boolean => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];

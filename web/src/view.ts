@@ -674,7 +674,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     },
     where: (i: number): Point | null => (last && i < scene.count ? spot(last.where, i) : null),
     hit: (px: number, py: number, reach: number): Hit | null => (last ? hitTest(targets(), px, py, reach) : null),
-    grip: (k: number): Point => gripOf(targets(), k, 12),
+    grip: (k: number): Point => gripOf(targets(), k, 24) ?? gripOf(targets(), k, 12) ?? [targets().discs[k].x, targets().discs[k].y],
     middle: (ball: Ball): Point => {
       const at = ballCenter(last?.where ?? new Float32Array(scene.count * d), ball);
       return project(at[0], at[1], at[2]);

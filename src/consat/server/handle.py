@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import webbrowser
+from contextlib import ExitStack
 from typing import Any, Self
 
 import uvicorn
@@ -26,13 +27,17 @@ LARGEST = 65536
 class Live:
     """A team that lives on a page.
 
+    Args:
+        simulation: the team; it is started.
+        host: what `listening` is bound to.
+        listening: where pages connect to.
+
     Attributes:
         url: where the page is.
     """
 
-    def __init__(self, simulation: Simulation, host: str, port: int | None) -> None:
+    def __init__(self, simulation: Simulation, host: str, listening: socket.socket) -> None:
         token = None if host in LOOPBACK else secrets.token_urlsafe(24)
-        listening = _bound(host, port)
         number = listening.getsockname()[1]
         name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host  # noqa: S104
         self.url = f"http://{name}:{number}/" + ("" if token is None else f"?token={token}")
@@ -102,7 +107,10 @@ def live(
     """
     if port is not None and (not isinstance(port, int) or isinstance(port, bool) or not 0 <= port < 65536):
         raise InvalidSettings(f"port is {port!r}, but must be a whole number from 0 to 65535")
-    found = Live(Simulation(team, **settings), host, port)
+    with ExitStack() as stack:
+        listening = stack.enter_context(_bound(host, port))
+        found = Live(Simulation(team, **settings), host, listening)
+        stack.pop_all()  # the server closes it
     if open_page:
         webbrowser.open(found.url)
     interactive = hasattr(sys, "ps1") or "ipykernel" in sys.modules
