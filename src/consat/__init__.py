@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from consat.runs.solving import solve
     from consat.runs.sweeping import Sweep, sweep
     from consat.scenario import Scenario, dump, load, loads
+    from consat.server.handle import live
     from consat.settings import Ramp, Settings, Smoothing
 
 _HOME = {
@@ -40,6 +41,7 @@ _HOME = {
     "runs.solving": ("solve",),
     "runs.sweeping": ("Sweep", "sweep"),
     "scenario": ("Scenario", "dump", "load", "loads"),
+    "server.handle": ("live",),
     "settings": ("Ramp", "Settings", "Smoothing"),
     "problem.groups": ("Group", "each"),
     "problem.schedule": ("Schedule", "schedule"),
@@ -51,8 +53,8 @@ _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "Agent", "ConsatError", "Constraint", "Double", "Group", "InvalidExpression", "InvalidInput", "InvalidResult", "InvalidScenario",
     "InvalidSettings", "InvalidTeam", "Point", "Quadrotor", "Ramp", "Result", "Scenario", "Schedule", "Session", "Settings", "Smoothing",
-    "Sweep", "Team", "Unicycle", "apart", "box", "constraint", "disc", "displacement", "dump", "each", "expr", "halfspace", "load",
-    "loads", "margins", "near", "outside", "polygon", "resume", "run", "schedule", "solve", "sweep", "within",
+    "Sweep", "Team", "Unicycle", "apart", "box", "constraint", "disc", "displacement", "dump", "each", "expr", "halfspace", "live",
+    "load", "loads", "margins", "near", "outside", "polygon", "resume", "run", "schedule", "solve", "sweep", "within",
 ]  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from consat.cli.doctor import doctor, show_version
 from consat.cli.examples import add_examples
 from consat.cli.export import export, result_argument, show
 from consat.cli.keys import keys
+from consat.cli.live import live
 from consat.cli.network import agent, launch, split
 from consat.cli.terminal import (
     DONE,
@@ -366,7 +367,7 @@ def _file(result: Path) -> Path:
     return result / RESULT if result.is_dir() else result
 
 
-for command in (split, agent, launch, keys, export, show, doctor):
+for command in (split, agent, launch, keys, export, show, live, doctor):
     cli.add_command(command)
 add_examples(cli)
 

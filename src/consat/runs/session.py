@@ -177,6 +177,16 @@ class Session:
         return self._tally.done
 
     @property
+    def protocol(self) -> str:
+        """Its kind, such as ``interior-point``."""
+        return str(self._engine.ready.settings.protocol.kind)
+
+    @property
+    def rate(self) -> float:
+        """Rounds a second, Hz."""
+        return self._body.rate
+
+    @property
     def time(self) -> float:
         """s since the start, at `rate` rounds a second."""
         return self._tally.done / self._body.rate
@@ -371,6 +381,36 @@ class Session:
         self._restructure(_like(team, agents))
         return self
 
+    @float64
+    def become(self, team: Team) -> Self:
+        """Go on with another team; agents of ids that were in it stay where they are, and keep what they remember.
+
+        Args:
+            team: of the same dimension.
+
+        Raises:
+            InvalidTeam: its dimension is another, or agents that depend on each other could not reach one another; the session is as it
+                was.
+        """
+        if team.dimension != self.dimension:
+            raise InvalidTeam([Fault(("dimension",), f"dimension is {team.dimension}, but must stay {self.dimension}", "dimension")])
+        self._require_connected(team, "the team")
+        self._restructure(team)
+        return self
+
+    @float64
+    def lose(self, share: float) -> Self:
+        """Lose this share of the messages from now on; it compiles once more.
+
+        Raises:
+            InvalidSettings: it is no probability below 1.
+        """
+        options = dataclasses.replace(self._options, loss=share)
+        self._weather = options.weather(self._weather.seed)
+        self._options = options
+        self._restructure(self.team)
+        return self
+
     # ---- looking ------------------------------------------------------------------------------------------------------------------------
 
     @property
@@ -391,11 +431,7 @@ class Session:
     @float64
     def assess(self) -> Assessment:
         """What an observer can prove of the team as it is now, centrally."""
-        team = self.team.at(self.time)
-        best = max_min(team)
-        found = bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
-        lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
-        return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
+        return assessed(self.team.at(self.time))
 
     @float64
     def result(self) -> Result:
@@ -544,6 +580,15 @@ class Session:
         changes, bound = _raised(inner.memory.changes, inner.memory.bound, where)
         memory = inner.memory._replace(changes=changes, bound=bound)
         self._state = self._state._replace(state=inner._replace(memory=memory))
+
+
+@float64
+def assessed(team: Team) -> Assessment:
+    """What an observer can prove of a team whose constraints stand still, centrally."""
+    best = max_min(team)
+    found = bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
+    lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
+    return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
 
 
 def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:

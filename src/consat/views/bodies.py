@@ -79,12 +79,16 @@ def bodies(result: Result, data: Any) -> Bodies | None:
     known = machines(result)
     if known is None:
         return None
-    models = [known.own.get(str(agent), known.common) for agent in data["agent"].values]
-    radius, offset = (
-        np.array([float(np.max(getattr(model, name, 0.0))) for model in models], dtype=float) for name in ("radius", "offset")
-    )
+    radius, offset = sizes(known, [str(agent) for agent in data["agent"].values])
     heading = data["heading"].values if "heading" in data else None
     return Bodies(radius, offset, heading, offset > 0)
+
+
+def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) radius of the body of each agent, and (N,) how far its middle is behind its position, along its heading."""
+    models = [known.own.get(name, known.common) for name in ids]
+    radius, offset = ([float(np.max(getattr(model, name, 0.0))) for model in models] for name in ("radius", "offset"))
+    return np.array(radius, dtype=float), np.array(offset, dtype=float)
 
 
 def obstacles(result: Result) -> tuple[Obstacle, ...]:

@@ -1,7 +1,7 @@
 """A run as one HTML file that replays it offline: nothing is loaded, nothing is evaluated, everything lies inside.
 
-``replay.html`` is the page, ``replay.css`` its look, ``replay.js`` decodes the data and draws. The data is JSON; arrays are base64 of
-little-endian float32.
+``replay.html`` is the page, ``page.css`` its look, ``page.js`` decodes the data and draws; that is built from ``web/``, and the live page
+has it too. The data is JSON; arrays are base64 of little-endian float32.
 """
 
 from __future__ import annotations
@@ -25,21 +25,19 @@ from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.robots.description import obstacle_data
-from consat.views import bodies, space, words
+from consat.views import bodies, picture, words
 from consat.views.colours import classes
-from consat.views.figures import number, period, recorded, seconds, view
+from consat.views.figures import number, period, recorded, seconds
 from consat.views.outlines import MOST, outlines
-from consat.views.shapes import Balls, Walls, boxes, moves, shapes, ways
+from consat.views.picture import FEW, MOST_SHAPES
+from consat.views.shapes import Balls, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
 """Of a longer record some steps are replayed, evenly spread along what happens."""
-MOST_SHAPES: Final = 20_000
 MOST_OUTLINED: Final = 40
 """Moments at which the boundaries of moving regions are traced."""
 SPREAD: Final = 200
-FEW: Final = 12
-"""Up to so many agents have colours of their own, as in ``replay.js``."""
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> Path:
@@ -64,7 +62,7 @@ def page(result: Result) -> str:
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
     files = resources.files("consat.views")
-    style, script, html = ((files / f"replay.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "page.js", "replay.html"))
     data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     summary = result.summary
     status = summary["status"]
@@ -226,34 +224,22 @@ def _regions(
     team: Team | None, x: np.ndarray, times: np.ndarray, stand: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
     """The box to show, low and high, and the regions; `stand`, (B, 2, d), are boxes around obstacles."""
-    dimension = x.shape[2]
+    low, high = picture.frame(team, x, times, stand)
     if team is None or len(team.owner) > MOST_SHAPES:
-        low, high, _ = view(x, x[-1], None, stand)
         return low, high, {"balls": [], "walls": [], "outlines": []}
-    geometry = shapes(team, times[-1])
-    balls, around = geometry.balls, [boxes(team)[:, :, :dimension], ways(team, times)[:, :, :dimension]]
-    around += [] if stand is None else [stand]
-    if team.dimension <= 3:
-        center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
-        fixed = np.concatenate([center - radius, center + radius], axis=1)
-        around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
-    low, high, _ = view(x, x[-1], None, np.concatenate(around))
+    found = shapes(team, times[-1])
+    balls, walls = picture.constraints_of(team, found)
     moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
-    seen = [shapes(team, times[moment]) for moment in moments]
-    told: list[Mapping[str, Any]] = [
-        {
-            "center": balls.center[k].tolist(),
-            "around": int(balls.around[k]),
-            "radius": float(balls.radius[k]),
-            "out": bool(balls.keeps_out[k]),
-            "owners": list(balls.owners[k]),
-            "track": _track(moments, [each.balls for each in seen], k) if seen and balls.moves[k] else None,
-        }
-        for k in range(len(balls.radius))
-        if team.dimension <= 3
-    ]
-    lines = _outlines(team, geometry.others, x, times, low, high)
-    return low, high, {"balls": told, "walls": _walls(team, geometry.walls, low, high), "outlines": lines}
+    seen = [shapes(team, times[moment]).balls for moment in moments]
+    told: dict[str, list[Mapping[str, Any]]] = {
+        "balls": [
+            {**ball, "track": _track(moments, seen, k) if seen and found.balls.moves[k] else None}
+            for k, ball in enumerate(picture.balls_of(team, found, balls))
+        ],
+        "walls": picture.walls_of(team, found.walls, walls, low, high),
+        "outlines": _outlines(team, found.others, x, times, low, high),
+    }
+    return low, high, told
 
 
 def _moments(x: np.ndarray) -> np.ndarray:
@@ -268,17 +254,6 @@ def _track(moments: np.ndarray, seen: Sequence[Balls], k: int) -> Mapping[str, A
         "center": [np.round(balls.center[k], 6).tolist() for balls in seen],
         "radius": [round(float(balls.radius[k]), 6) for balls in seen],
     }
-
-
-def _walls(team: Team, walls: Walls, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
-    """Half-spaces as polygons within the view, of a team in the plane as lines; those of a box are cut by each other."""
-    if team.dimension not in (2, 3):
-        return []
-    beyond = 10 * (high - low) * (team.dimension == 2)  # a reader may pan
-    return [
-        {"corners": np.round(corners, 6).tolist(), "normal": walls.normal[k].tolist(), "owners": list(walls.owners[k])}
-        for k, corners in space.faces(walls, low - beyond, high + beyond)
-    ]
 
 
 def _outlines(

@@ -1,0 +1,45 @@
+"""``consat live``: the team on a page."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from typing import Any
+
+import click
+
+from consat.cli.terminal import located, scenario_argument, set_option
+from consat.network.deploy.environment import keep_compilations
+
+NEEDED = ("starlette", "uvicorn", "websockets")
+
+
+@click.command()
+@scenario_argument
+@set_option
+@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; others than this machine get in with a token.")
+@click.option("--port", type=click.IntRange(0, 65535), default=None, help="Where to listen; 8137, or a free one, if not given.")
+@click.option("--open/--no-open", "opens", default=True, help="Open the page in a browser.")
+@click.option("--protocol", metavar="KIND", help="One in rounds: interior-point (default), max-min, admm, proximal, selfish.")
+@click.option("--seed", type=click.IntRange(min=0), help="Of starts, and of what gets lost.")
+@click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
+def live(scenario: str, overrides: tuple[str, ...], host: str, port: int | None, opens: bool, **settings: Any) -> None:
+    """Watch a team, and take hold of it, on a page.
+
+    FILE is a scenario. The page shows the team as it runs: drag its goals, kill agents, cut links. Ctrl-C ends it.
+    """
+    keep_compilations(os.environ)
+    if missing := [name for name in NEEDED if find_spec(name) is None]:
+        raise click.UsageError(f"the live page needs {', '.join(missing)}; install them with: pip install 'consat[live]'")
+    from consat.scenario import load
+    from consat.server.handle import live as serve
+
+    loaded = load(scenario, overrides)
+    click.echo(f"compiling {loaded.name} …", err=True)
+    with located(loaded):
+        page = serve(loaded, host=host, port=port, open_page=False, block=False, **settings)
+    click.echo(page.url)
+    click.echo("Ctrl-C ends it", err=True)
+    if opens:
+        click.launch(page.url)
+    page.wait()

@@ -1,0 +1,128 @@
+"""``consat.live``: a session, a server, and a browser that shows it."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from contextlib import ExitStack
+from typing import Any, Self
+
+import uvicorn
+
+from consat.errors import InvalidSettings, NetworkError
+from consat.problem.team import Team
+from consat.scenario import Scenario
+from consat.server.app import LOOPBACK, Host
+from consat.server.simulation import Simulation
+
+PORT = 8137
+LARGEST = 65536
+"""Bytes of a message at which a client is shut out; shorter ones that are too long are answered."""
+
+
+class Live:
+    """A team that lives on a page.
+
+    Args:
+        simulation: the team; it is started.
+        host: what `listening` is bound to.
+        listening: where pages connect to.
+
+    Attributes:
+        url: where the page is.
+    """
+
+    def __init__(self, simulation: Simulation, host: str, listening: socket.socket) -> None:
+        token = None if host in LOOPBACK else secrets.token_urlsafe(24)
+        number = listening.getsockname()[1]
+        name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host  # noqa: S104
+        self.url = f"http://{name}:{number}/" + ("" if token is None else f"?token={token}")
+        self._simulation = simulation
+        config = uvicorn.Config(
+            Host(simulation, token).app, log_level="critical", access_log=False, lifespan="off", ws="websockets-sansio",
+            ws_max_size=LARGEST, ws_per_message_deflate=False, timeout_graceful_shutdown=1, server_header=False,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._server.run, args=([listening],), name="consat server", daemon=True)
+        simulation.start()
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.01)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still goes on."""
+        return self._thread.is_alive() and self._simulation.alive
+
+    def wait(self) -> Self:
+        """Wait until it ends, or until Ctrl-C, which ends it."""
+        try:
+            while self.alive:
+                time.sleep(0.2)
+        except KeyboardInterrupt:
+            pass
+        self.close()
+        return self
+
+    def close(self) -> None:
+        """End the session and the server."""
+        self._server.should_exit = True
+        self._simulation.close()
+        self._thread.join(timeout=10.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Live {self._simulation.name} at {self.url}{'' if self.alive else ', closed'}>"
+
+
+def live(
+    team: Team | Scenario | str, *, host: str = "127.0.0.1", port: int | None = None, open_page: bool = True, block: bool | None = None,
+    **settings: Any,
+) -> Live:  # fmt: skip
+    """Watch a team, and take hold of it, on a page.
+
+    Args:
+        team: a `consat.Team` or a scenario, as in `consat.run`.
+        host: address to listen on. Others than this machine's own ask for the token that `Live.url` ends with.
+        port: to listen on, 0 for a free one; if None, 8137, or a free one where that is taken.
+        open_page: whether to open a browser.
+        block: whether to return only when it ends, with Ctrl-C; by default so in scripts, not where Python is used interactively.
+        settings: as of `consat.Session`, such as ``protocol``, ``seed`` and ``loss``.
+
+    Returns:
+        a handle with ``url`` and ``close()``.
+
+    Raises:
+        NetworkError: nothing can listen there.
+        ConsatError: as `consat.Session`.
+    """
+    if port is not None and (not isinstance(port, int) or isinstance(port, bool) or not 0 <= port < 65536):
+        raise InvalidSettings(f"port is {port!r}, but must be a whole number from 0 to 65535")
+    with ExitStack() as stack:
+        listening = stack.enter_context(_bound(host, port))
+        found = Live(Simulation(team, **settings), host, listening)
+        stack.pop_all()  # the server closes it
+    if open_page:
+        webbrowser.open(found.url)
+    interactive = hasattr(sys, "ps1") or "ipykernel" in sys.modules
+    return found if block is False or (block is None and interactive) else found.wait()
+
+
+def _bound(host: str, port: int | None) -> socket.socket:
+    """A socket that listens there."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, PORT if port is None else port), family=family)
+    except OSError as error:
+        if port is None:
+            return _bound(host, 0)
+        raise NetworkError(f"nothing can listen on {host}, port {port}: {error.strerror or error}; choose another") from None

@@ -1,0 +1,194 @@
+"""What a page may ask for: JSON, bounded, checked field by field before anything happens. Nothing of it is ever evaluated."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from consat.errors import InvalidSettings, shown
+
+LONGEST: Final = 4096
+"""Bytes of an order."""
+MOST_ROUNDS: Final = 1000
+FASTEST: Final = 1000.0
+
+Number: TypeAlias = Annotated[int, Field(ge=0, lt=2**53)] | None
+Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=200)]
+Text: TypeAlias = Annotated[str, Field(max_length=2000)]
+Vector: TypeAlias = Annotated[list[float], Field(min_length=1, max_length=64)]
+Place: TypeAlias = Annotated[int, Field(ge=0, lt=2**31)]
+Names: TypeAlias = Annotated[list[Name], Field(max_length=64)]
+Parameters: TypeAlias = Annotated[dict[Name, float | Vector], Field(min_length=1, max_length=8)]
+Described: TypeAlias = Annotated[dict[Name, float | Vector | Text], Field(max_length=12)]
+"""A constraint as a scenario file has it."""
+
+
+class Order(BaseModel):
+    """What all orders have: a number that the answer repeats, and the gesture that it belongs to, which is undone as a whole."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    id: Number = None
+    gesture: Number = None
+
+
+class Change(Order):
+    """Other parameters of a constraint."""
+
+    do: Literal["change"]
+    agent: Name
+    constraint: Name
+    parameters: Parameters
+
+
+class Shape(Order):
+    """A ball, by its place in the scene, somewhere else or of another size, for all whose it is."""
+
+    do: Literal["shape"]
+    scene: Place
+    shape: Place
+    center: Vector | None = None
+    radius: float | None = None
+
+
+class Wall(Order):
+    """A half-space, by its place in the scene, further along its normal, for all whose it is."""
+
+    do: Literal["wall"]
+    scene: Place
+    wall: Place
+    offset: float
+
+
+class Put(Order):
+    """A body somewhere else."""
+
+    do: Literal["place"]
+    agent: Name
+    position: Vector
+
+
+class Add(Order):
+    """An agent that joins."""
+
+    do: Literal["add"]
+    agent: Name
+    position: Vector
+    constraints: Annotated[list[Described], Field(max_length=16)] = []
+    links: Names | None = None
+
+
+class OfAgent(Order):
+    """An agent that leaves, falls silent, or comes back."""
+
+    do: Literal["remove", "kill", "revive"]
+    agent: Name
+
+
+class OfLink(Order):
+    """A link that is cut, or laid."""
+
+    do: Literal["connect", "disconnect"]
+    one: Name
+    other: Name
+
+
+class AddConstraint(Order):
+    """One more constraint."""
+
+    do: Literal["add_constraint"]
+    agent: Name
+    constraint: Described
+
+
+class RemoveConstraint(Order):
+    """One constraint less."""
+
+    do: Literal["remove_constraint"]
+    agent: Name
+    constraint: Name
+
+
+class Step(Order):
+    """Some rounds, while it pauses."""
+
+    do: Literal["step"]
+    rounds: Annotated[int, Field(ge=1, le=MOST_ROUNDS)] = 1
+
+
+class Speed(Order):
+    """Rounds a second."""
+
+    do: Literal["speed"]
+    rounds: Annotated[float, Field(gt=0, le=FASTEST)]
+
+
+class Loss(Order):
+    """The share of messages that get lost."""
+
+    do: Literal["loss"]
+    share: Annotated[float, Field(ge=0, lt=1)]
+
+
+class Protocol(Order):
+    """Begin anew with another protocol, from where everybody is."""
+
+    do: Literal["protocol"]
+    kind: Name
+
+
+class Plain(Order):
+    """Orders of one word."""
+
+    do: Literal["play", "pause", "undo", "restart", "text"]
+
+
+Any_: TypeAlias = Annotated[
+    Change | Shape | Wall | Put | Add | OfAgent | OfLink | AddConstraint | RemoveConstraint | Step | Speed | Loss | Protocol | Plain,
+    Field(discriminator="do"),
+]
+_ORDER: Final[TypeAdapter[Any]] = TypeAdapter(Any_)
+
+
+def parse(raw: str | bytes) -> Order:
+    """An order from what a page sent.
+
+    Raises:
+        InvalidSettings: says what is wrong with it.
+    """
+    content = _content(raw)
+    if len(content) > LONGEST:
+        raise InvalidSettings(f"the message has {len(content):,} bytes, but may have at most {LONGEST:,}")
+    try:
+        order: Order = _ORDER.validate_json(content)
+    except ValidationError as error:
+        raise InvalidSettings(_words(error)) from None
+    return order
+
+
+class _Numbered(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    id: Number = None
+
+
+def number_of(raw: str | bytes) -> int | None:
+    """The number of a message that is no order, so that its answer can repeat it; None if it has none."""
+    content = _content(raw)
+    try:
+        return None if len(content) > LONGEST else _Numbered.model_validate_json(content).id
+    except ValidationError:
+        return None
+
+
+def _content(raw: str | bytes) -> bytes:
+    return raw.encode("utf-8", "surrogatepass") if isinstance(raw, str) else raw
+
+
+def _words(error: ValidationError) -> str:
+    """The first fault."""
+    first = error.errors(include_url=False, include_context=False)[0]
+    place = ".".join(str(part) for part in first["loc"][1:] if not isinstance(part, str) or part.isidentifier())
+    given = "" if first["type"] in ("missing", "json_invalid") else f"; it is {shown(first['input'])}"
+    return f"{place[:100] or 'message'}: {first['msg'][0].lower()}{first['msg'][1:]}{given}"

@@ -1,0 +1,137 @@
+"""What stands still of a team, as the page knows it: who there is, links, regions, and the box that holds them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from consat.errors import Fault, InvalidTeam
+from consat.problem.family import Family
+from consat.problem.team import Team
+from consat.robots.description import Robots, obstacle_data
+from consat.views import bodies, picture
+from consat.views.outlines import MOST, outlines
+from consat.views.shapes import Shapes, moves, shapes
+
+MOST_LISTED: Final = 2000
+"""Constraints that are listed for people to choose from."""
+CENTERS: Final[Mapping[str, str]] = {"within": "center", "outside": "center", "displacement": "vector"}
+"""Which parameter of a ball says where it is."""
+
+
+class Scene(NamedTuple):
+    """A team as it is drawn.
+
+    Attributes:
+        number: counts scenes; frames say of which they are.
+        team: with its constraints as they stand.
+        shapes: their geometry.
+        balls: of each ball the numbers of its constraints.
+        walls: of each half-space likewise.
+        low: (p,) corner of the box that is shown, p at most 3.
+        high: (p,) its other corner.
+    """
+
+    number: int
+    team: Team
+    shapes: Shapes
+    balls: list[list[int]]
+    walls: list[list[int]]
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, number: int, team: Team, x: np.ndarray, robots: Robots | None = None) -> Scene:
+        """The scene of a team at x (N, d)."""
+        paths = x[None, :, :3]
+        stand = None if robots is None or paths.shape[2] < 2 else bodies.bounds(robots.obstacles, paths.shape[2])
+        low, high = picture.frame(team, paths, stand=stand)
+        drawn = team if len(team.owner) <= picture.MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
+        found = shapes(drawn)
+        return cls(number, team, found, *picture.constraints_of(drawn, found), low, high)
+
+    def moved(self, team: Team) -> Scene | None:
+        """With half-spaces as they are in `team`; None if no longer the same constraints share them."""
+        found = shapes(team)
+        balls, walls = picture.constraints_of(team, found)
+        return self._replace(team=team, shapes=found) if (balls, walls) == (self.balls, self.walls) else None
+
+    def text(self, name: str, robots: Robots | None) -> str:
+        """As JSON."""
+        team, listed = self.team, len(self.team.owner) <= MOST_LISTED
+        sizes = None if robots is None else bodies.sizes(robots, team.ids)
+        data = {
+            "type": "scene",
+            "number": self.number,
+            "name": name,
+            "unit": team.unit,
+            "dimension": min(3, team.dimension),
+            "ids": list(team.ids),
+            "links": team.links.ravel().tolist(),
+            "low": np.round(self.low, 6).tolist(),
+            "high": np.round(self.high, 6).tolist(),
+            "balls": self.told_balls(),
+            "walls": self.told_walls(),
+            "constraints": [[int(owner), name] for owner, name in zip(team.owner, team.names, strict=True)] if listed else [],
+            "obstacles": [] if robots is None else [obstacle_data(each) for each in robots.obstacles],
+            "bodies": None if sizes is None else {"radius": sizes[0].tolist(), "offset": sizes[1].tolist()},
+        }
+        return json.dumps(data, separators=(",", ":"), allow_nan=False)
+
+    def told_balls(self) -> list[dict[str, Any]]:
+        """The balls as the page knows them."""
+        return picture.balls_of(self.team, self.shapes, self.balls)
+
+    def told_walls(self) -> list[Mapping[str, Any]]:
+        """The half-spaces as the page knows them."""
+        return picture.walls_of(self.team, self.shapes.walls, self.walls, self.low, self.high)
+
+    def traced(self, team: Team, x: np.ndarray) -> str | None:
+        """The boundaries of other ψ, as JSON; None where there are none to trace."""
+        numbers = self.shapes.others
+        if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+            return None
+        ties = moves(team)[numbers]
+        lines = outlines(team, numbers.tolist(), x, self.low, self.high)
+        found = [
+            {"at": [0], "lines": [[np.round(line, 4).ravel().tolist() for line in each]], "owners": [int(team.owner[k])], "ties": bool(tie)}
+            for k, each, tie in zip(numbers.tolist(), lines, ties, strict=True)
+        ]
+        return json.dumps({"type": "outlines", "number": self.number, "outlines": found}, separators=(",", ":"), allow_nan=False)
+
+
+def place_of(team: Team, number: int) -> tuple[Family, int]:
+    """The family of a constraint, and its place in it."""
+    for family in team.families:
+        found = np.flatnonzero(family.number == number)
+        if len(found):
+            return family, int(found[0])
+    raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
+
+
+def named(team: Team, agent: str, constraint: str) -> list[int]:
+    """The numbers of an agent's constraint of this name, or of the sides of a box; none if there is none."""
+    ids = list(team.ids)
+    if agent not in ids:
+        return []
+    own = [int(k) for k in np.flatnonzero(team.owner == ids.index(agent))]
+    exact = [k for k in own if team.names[k] == constraint]
+    return exact or [k for k in own if team.names[k].startswith((f"{constraint}.low[", f"{constraint}.high["))]
+
+
+def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> dict[str, Any]:
+    """What some parameters of a constraint are now, schedules included, so that they can be put back."""
+    found: dict[str, Any] = {}
+    for number in numbers:
+        family, k = place_of(team, number)
+        for key in keys:
+            if key == "weight":
+                found[key] = float(family.weight[k])
+            elif key in family.parameters:
+                track = family.tracks.get(key)
+                schedule = None if track is None else track.schedule(k)
+                found[key] = np.array(family.parameters[key][k]) if schedule is None else schedule
+    return found

@@ -1,0 +1,206 @@
+"""The live page in a real browser: a real mouse takes hold of things, and the team answers."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import consat as cs
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+    from playwright.sync_api import Page as Tab
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+MISSING = "there is no Chromium; on Debian: apt-get install chromium" if BROWSER is None else ""
+if not MISSING and importlib.util.find_spec("playwright") is None:
+    MISSING = "there is no playwright; pip install playwright"
+if MISSING and os.environ.get("CONSAT_BROWSER_REQUIRED"):
+    pytest.fail(MISSING, pytrace=False)
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"])
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator[Any]:
+    with cs.live("case-b", seed=1, port=0, open_page=False, block=False) as found:
+        yield found
+
+
+@pytest.fixture
+def tab(browser: Browser, live: Any) -> Iterator[Tab]:
+    yield from opened(browser, live.url)
+
+
+def opened(browser: Browser, url: str, **options: Any) -> Iterator[Tab]:
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, **options)
+    found, said = context.new_page(), list[str]()
+    found.on("pageerror", lambda error: said.append(str(error)))
+    found.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    found.goto(url)
+    until(found, "consat.agents().length > 0 && consat.round > 2")
+    yield found
+    context.close()
+    assert not [each for each in said if "WebSocket" not in each], said
+
+
+def until(tab: Tab, holds: str, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not tab.evaluate(holds):
+        assert time.monotonic() < end, (holds, tab.evaluate("[consat.round, consat.margin, consat.verdict, consat.agents()]"))
+        tab.wait_for_timeout(50)
+
+
+def drag(tab: Tab, start: list[float], by: tuple[float, float]) -> None:
+    tab.mouse.move(*start)
+    tab.mouse.down()
+    tab.mouse.move(start[0] + by[0] / 2, start[1] + by[1] / 2, steps=5)
+    tab.mouse.move(start[0] + by[0], start[1] + by[1], steps=5)
+    tab.mouse.up()
+
+
+def test_mouse_drags_a_goal_and_the_team_follows_and_undoes(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9")
+    handle, before = tab.evaluate("consat.handle('a1', 'goal')"), tab.evaluate("consat.where('a1')")
+    drag(tab, handle, (60, -60))
+    until(tab, f"consat.margin > 0 && consat.where('a1')[0] > {before[0] + 25} && consat.where('a1')[1] < {before[1] - 25}")
+    tab.get_by_label("Undo the last change").click()
+    until(tab, f"consat.margin > 0.9 && Math.abs(consat.where('a1')[0] - {before[0]}) < 12")
+
+
+def test_rim_changes_the_radius(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9 && consat.verdict == 'feasible'")
+    middle = tab.evaluate("consat.handle('a3', 'goal')")
+    rim = next([middle[0] - r, middle[1]] for r in range(20, 160) if told(tab, middle[0] - r, middle[1]).startswith("a3: goal, radius"))
+    drag(tab, rim, (-40, 0))
+    until(tab, "consat.bounds && consat.bounds[1] > 1.05 || consat.reasons.join().includes('a1')")
+    text = tab.evaluate("consat.send({do: 'text'})")["text"]
+    goal = next(each for each in cs.loads(text).team.agents if each.id == "a3").constraints[0]
+    assert goal.parameters["radius"].value > 1.2
+    tab.keyboard.press("z")
+    until(tab, "consat.bounds && Math.abs(consat.bounds[1] - 1) < 1e-3")
+
+
+def told(tab: Tab, x: float, y: float) -> str:
+    tab.mouse.move(x, y)
+    tip = tab.locator("[data-part=tip]")
+    return (tip.text_content() or "") if tip.is_visible() else ""
+
+
+def test_team_torn_apart_says_why(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9")
+    drag(tab, tab.evaluate("consat.handle('a1', 'goal')"), (330, 0))
+    until(tab, "consat.verdict == 'infeasible'")
+    assert "can't be done, proven" in tab.locator("[data-part=verdict]").inner_text()
+    assert "cannot all hold" in tab.locator("[data-part=reasons]").inner_text()
+    tab.keyboard.press("z")
+    until(tab, "consat.verdict == 'feasible' && consat.margin > 0.9")
+
+
+def test_agent_is_killed_and_revived_and_a_link_that_must_stay_is_not_cut(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9")
+    tab.mouse.click(*tab.evaluate("consat.where('a2')"))
+    tab.get_by_role("button", name="Cut the link between a2 and a1").click()
+    tab.locator("[data-part=note].bad").wait_for()
+    assert "without the link" in tab.locator("[data-part=note]").inner_text()
+    tab.get_by_role("button", name="Kill a2").click()
+    until(tab, "consat.agents().join() == 'a1,a3'")
+    tab.locator("[data-part=rows] .silent").click()
+    until(tab, "consat.agents().join() == 'a1,a2,a3' && consat.margin > 0.9")
+
+
+def test_link_is_cut_by_the_mouse_and_healed(tab: Tab) -> None:
+    assert tab.evaluate("consat.send({do: 'connect', one: 'a1', other: 'a3'})")["ok"]
+    until(tab, "consat.margin > 0.9")
+    tab.get_by_label("Pause").click()
+    tab.evaluate("consat.send({do: 'place', agent: 'a2', position: [0, 2]})")  # off the line between the others
+    tab.wait_for_timeout(300)
+    a1, a3 = (tab.evaluate(f"consat.where('{each}')") for each in ("a1", "a3"))
+    free = next(
+        [a1[0] + t * (a3[0] - a1[0]), a1[1] + t * (a3[1] - a1[1])]
+        for t in (k / 40 for k in range(1, 40))
+        if told(tab, a1[0] + t * (a3[0] - a1[0]), a1[1] + t * (a3[1] - a1[1])) == "link a1 – a3"
+    )
+    tab.mouse.click(*free)
+    tab.get_by_role("button", name="Cut the link between a1 and a3").click()
+    tab.get_by_role("button", name="Heal the link between a1 and a3").click()
+    tab.get_by_role("button", name="Heal the link between a1 and a3").wait_for(state="detached")
+    tab.get_by_label("Play", exact=True).click()
+    assert tab.evaluate("consat.send({do: 'disconnect', one: 'a1', other: 'a3'})")["ok"]
+
+
+def test_two_browsers_see_the_same(browser: Browser, tab: Tab, live: Any) -> None:
+    for other in opened(browser, live.url):
+        tab.get_by_label("Pause").click()
+        other.get_by_label("Play", exact=True).wait_for()
+        until(other, f"consat.round == {tab.evaluate('consat.round')}")
+        assert other.evaluate("consat.where('a1')") == pytest.approx(tab.evaluate("consat.where('a1')"), abs=0.01)
+        other.keyboard.press(" ")
+        tab.get_by_label("Pause").wait_for()
+
+
+def test_touch_drags_too(browser: Browser, live: Any) -> None:
+    for tab in opened(browser, live.url, has_touch=True):
+        until(tab, "consat.margin > 0.9")
+        x, y = tab.evaluate("consat.handle('a1', 'goal')")
+        before = tab.evaluate("consat.where('a1')")
+        session = tab.context.new_cdp_session(tab)
+        for kind, dx in (("touchStart", 0), ("touchMove", 30), ("touchMove", 60), ("touchEnd", 60)):
+            points = [] if kind == "touchEnd" else [{"x": x + dx, "y": y}]
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+            tab.wait_for_timeout(50)
+        until(tab, f"consat.where('a1')[0] > {before[0] + 20}")
+        tab.evaluate("consat.send({do: 'undo'})")
+
+
+def test_every_control_has_a_name(tab: Tab) -> None:
+    tab.mouse.click(*tab.evaluate("consat.where('a2')"))
+    tab.locator("[data-part=panel]").wait_for()
+    nameless = tab.evaluate("""[...document.querySelectorAll('button, input, select, canvas')]
+        .filter((each) => !each.getAttribute('aria-label') && !(each.closest('label') ?? each).textContent.trim())
+        .map((each) => each.outerHTML)""")
+    assert nameless == []
+
+
+def test_page_reconnects_when_the_server_is_there_again(browser: Browser) -> None:
+    first = cs.live("case-b", seed=1, port=0, open_page=False, block=False)
+    port = int(first.url.rstrip("/").rpartition(":")[2])
+    pages = opened(browser, first.url)
+    tab = next(pages)
+    first.close()
+    tab.locator("[data-part=note].bad").wait_for()
+    assert "the connection to the session is gone" in tab.locator("[data-part=note]").inner_text()
+    with cs.live("case-b", seed=2, port=port, open_page=False, block=False):
+        tab.locator("[data-part=note].bad").wait_for(state="hidden")
+        until(tab, "consat.margin > 0.9")
+    for _ in pages:
+        pass
+
+
+def test_replay_opens_from_disk_with_the_network_off(browser: Browser, tmp_path: Path) -> None:
+    page = cs.run("case-b", rounds=30).html(tmp_path / "run.html")
+    context = browser.new_context(offline=True)
+    tab, said = context.new_page(), list[str]()
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.on("request", lambda request: said.append(request.url) if not request.url.startswith("file:") else None)
+    tab.goto(page.resolve().as_uri())
+    until(tab, "consat.round >= 29.9")
+    assert tab.evaluate("consat.agents()") == ["a1", "a2", "a3"]
+    context.close()
+    assert not said
