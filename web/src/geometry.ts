@@ -13,6 +13,8 @@ export interface Disc {
   moves: boolean;
   inside: boolean;
   rim: boolean;
+  /** Whether it comes before the agents. */
+  first: boolean;
 }
 
 export interface Targets {
@@ -54,6 +56,9 @@ export function hitTest(targets: Targets, px: number, py: number, reach: number)
   };
   const { agents, discs, walls, links } = targets;
   const middle = (k: number) => (discs[k].moves ? Math.hypot(discs[k].x - px, discs[k].y - py) : Number.POSITIVE_INFINITY);
+  // In a crowd agents sit on their goals: there the goal is what is taken hold of.
+  const small = nearest(discs.length, (k) => (discs[k].first ? middle(k) : Number.POSITIVE_INFINITY), reach * 0.8);
+  if (small >= 0) return { kind: "grip", k: small };
   const agent = nearest(agents.length, (k) => Math.hypot(agents[k][0] - px, agents[k][1] - py), reach);
   if (agent >= 0) return { kind: "agent", k: agent };
   const grip = nearest(discs.length, middle, reach);

@@ -181,7 +181,7 @@ export function createLive(root: HTMLElement) {
       part("count").textContent = `${ids.length.toLocaleString("en")} agents${scene.few ? "" : ", the tightest first"}`;
       part("names").closest("label")!.hidden = !scene.few;
       const k = who === null ? -1 : ids.indexOf(who);
-      view.show.chosen = k >= 0 ? { kind: "agent", k } : same ? chosen : null;
+      view.show.chosen = k >= 0 ? { kind: "agent", k } : null;
       stale = true;
       gone();
       panel.update();

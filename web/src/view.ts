@@ -670,7 +670,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
 
   function targets(): Targets {
     const where = last?.where ?? new Float32Array(scene.count * d);
-    const bare = { x: 0, y: 0, r: 0, moves: false, inside: false, rim: false };
+    const bare = { x: 0, y: 0, r: 0, moves: false, inside: false, rim: false, first: false };
     const links: [Point, Point][] = [];
     if (show.links && scene.count <= 300) {
       for (let k = 0; k < scene.links.length; k += 2) links.push([places[scene.links[k]], places[scene.links[k + 1]]]);
@@ -685,7 +685,15 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         const [x, y] = project(at[0], at[1], at[2]);
         const r = scale * ball.radius;
         const moves = ball.around < 0 || (loud && ball.center.some((value) => value !== 0));
-        return { x, y, r, moves, inside: moves && ball.around < 0 && (scene.few || loud || r <= LARGEST_GRIP), rim: scene.few || loud };
+        return {
+          x,
+          y,
+          r,
+          moves,
+          inside: moves && ball.around < 0 && (scene.few || loud || r <= LARGEST_GRIP),
+          rim: scene.few || loud,
+          first: moves && !scene.few && r < 20,
+        };
       }),
       walls:
         show.handles && show.regions && !scene.space

@@ -21,6 +21,7 @@ from consat.network.deploy.environment import keep_compilations
 SCHEMA: Final = "consat.doctor/1"
 LIBRARIES: Final = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "cvxpy-base", "clarabel", "xarray", "h5netcdf", "matplotlib", "click")
 EXTRAS: Final[Mapping[str, Sequence[str]]] = {
+    "live": ("starlette", "uvicorn", "websockets"),
     "mcap": ("foxglove-sdk",),
     "network": ("cryptography", "eclipse-zenoh"),
     "video": ("av",),

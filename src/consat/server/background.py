@@ -23,7 +23,7 @@ class Background(Generic[T]):
     def __init__(self, work: Callable[[T], None], pause: float, longest: float, name: str) -> None:
         self._work, self._pause, self._longest = work, pause, longest
         self._asked: list[T] = []
-        self._first = self._last = 0.0
+        self._first = self._last = self._took = 0.0
         self._open, self._change = True, threading.Condition()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -52,10 +52,13 @@ class Background(Generic[T]):
                 if not self._open:
                     return
                 [task], self._asked = self._asked, []
+            begun = time.monotonic()
             self._work(task)
+            self._took = time.monotonic() - begun
 
     def _wait(self) -> float:
         """Seconds until it is time."""
         if not self._asked:
             return 1.0
-        return min(self._last + self._pause, self._first + self._longest) - time.monotonic()
+        patience = self._longest + 4.0 * self._took  # what takes long is done more rarely, so that it slows nobody
+        return min(self._last + self._pause, self._first + patience) - time.monotonic()
