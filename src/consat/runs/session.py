@@ -202,6 +202,7 @@ class Session:
         return np.array(self._margins)
 
     @property
+    @float64
     def headings(self) -> np.ndarray | None:
         """(N,) which way robots look, rad; None where bodies are points."""
         drive, robots = self._body.drive, self._state.robots
