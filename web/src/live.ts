@@ -868,11 +868,18 @@ export function createLive(root: HTMLElement) {
         const [x, y] = view.middle(scene.balls[k]);
         return inPage([x + scene.balls[k].radius * view.scale, y]);
       }
-      const wall = scene.walls.find(mine);
-      if (!wall) return null;
-      const [a, b] = view.line(wall);
-      const inside = [0.5, 0.45, 0.55, 0.4, 0.6].map((t): Point => [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])]);
-      return inPage(inside.find(([x, y]) => x > 0 && y > 0 && x < stage.clientWidth && y < stage.clientHeight) ?? inside[0]);
+      const walls = [...scene.walls.keys()].filter((place) => mine(scene.walls[place]));
+      for (const place of walls) {
+        const [from, to] = view.line(scene.walls[place]);
+        for (let step = 0; step < 98; step += 1) {
+          const t = 0.5 + ((step % 2 ? 1 : -1) * Math.ceil(step / 2)) / 100;
+          const at: Point = [from[0] + t * (to[0] - from[0]), from[1] + t * (to[1] - from[1])];
+          const seen = at[0] > 0 && at[1] > 0 && at[0] < stage.clientWidth && at[1] < stage.clientHeight;
+          const hit = seen ? view.hit(...at, MOUSE) : null;
+          if (hit?.kind === "wall" && hit.k === place) return inPage(at);
+        }
+      }
+      return null;
     },
     send: (message: Record<string, unknown>) => order_(message),
   };

@@ -5,6 +5,8 @@ import type { Ball, Frame, Obstacle, Outline, Scene, Wall } from "./model";
 import { THEMES, type Theme, type ThemeName } from "./theme";
 
 const MOST_SEGMENTS = 30000;
+/** Of more agents no paths are drawn. */
+const MOST_TRAILS = 3000;
 /** Regions of a crowd can be taken by their inside up to this size, px; larger ones would leave no ground to pan by. */
 const LARGEST_GRIP = 70;
 
@@ -406,6 +408,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
 
   function drawTrails(frame: Frame): void {
     const { past, sample } = frame;
+    if (scene.count > MOST_TRAILS) return;
     const stride = Math.max(1, Math.ceil(((sample + 1) * scene.count) / MOST_SEGMENTS));
     const one = (i: number) => {
       let on = false;
