@@ -24,6 +24,7 @@ from consat.numerics import float64
 from consat.problem.family import Family
 from consat.problem.objective import Nu
 from consat.problem.team import Agent, Team
+from consat.robots.description import Robots
 from consat.scenario import Scenario, dump
 from consat.scenario.document import LARGEST, Document, decode, read
 from consat.scenario.schema import build
@@ -103,6 +104,7 @@ class Part:
         first: (copies, d) first estimates of the positions it holds, in the order of `team.ids`.
         absent: agents that are not there in the beginning, and may join.
         neighbours: whom it talks to, in the team's order.
+        robots: what its body is, and the public map; None for a point that goes where it wants.
     """
 
     name: str
@@ -121,6 +123,7 @@ class Part:
     first: np.ndarray
     absent: frozenset[str]
     neighbours: tuple[Neighbour, ...]
+    robots: Robots | None = None
 
     @property
     def nu(self) -> Nu:
@@ -274,8 +277,14 @@ def split(
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
+            _robot(scenario.robots, agent),
         )  # fmt: skip
     return parts
+
+
+def _robot(robots: Robots | None, agent: str) -> Robots | None:
+    """Its own, and the map."""
+    return None if robots is None else replace(robots, common=robots.own.get(agent, robots.common), own={})
 
 
 def _word(name: str) -> str:
@@ -288,7 +297,7 @@ def write_part(part: Part) -> str:
     Raises:
         InvalidTeam: it has constraints that are Python functions; no file can hold them.
     """
-    scenario = read(dump(part.team, part.settings, part.name), part.me).root
+    scenario = read(dump(part.team, part.settings, part.name, robots=part.robots), part.me).root
     assert scenario is not None
     return write(
         {
@@ -343,13 +352,13 @@ def read_part(text: str, file: str) -> Part:
     if document.faults:
         raise document.invalid()
     assert document.root is not None
-    team, settings, name, *_ = build(Document(file, document.root.value["scenario"]))
+    team, settings, name, robots, _ = build(Document(file, document.root.value["scenario"]))
     if faults := list(_unfit(frame, team, settings)):
         raise document.invalid(faults)
     return Part(
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
         frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
-        np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours,
+        np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours, robots,
     )  # fmt: skip
 
 
