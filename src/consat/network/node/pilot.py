@@ -21,7 +21,7 @@ from consat.numerics import quick_compilation
 from consat.robots import Drive, Planner, Unicycle, deadlock
 from consat.robots import filter as safety
 from consat.robots.description import Robots, kind_of
-from consat.robots.model import LARGEST
+from consat.robots.model import LARGEST, along
 from consat.robots.neighbours import candidates, near
 from consat.robots.point import Point
 from consat.robots.unicycle import UnicycleState
@@ -122,7 +122,7 @@ class RobotBody(MeasuredBody):
         _, around = near(candidates(everybody), everybody, SEEN, drive.range)
         planes = safety.neighbour_planes(everybody, None, size, around, SHARE, explained=drive.explained)
         first, mine = (jax.tree.map(lambda leaf: leaf[:1], each) for each in (planes, around))
-        first = first._replace(least=first.least + safety.along(first.normals, own - middle))
+        first = first._replace(least=first.least + along(first.normals, own - middle))
         allowed = first
         if drive.map.count:
             allowed = safety.joined(
@@ -138,7 +138,7 @@ class RobotBody(MeasuredBody):
         wish = deadlock.bent(drive.rules, way, pace, model.pace(1), underway=underway, blocked=blocked[None], seen=seen)
         command, _, straight = safety.steered(model, state, wish, way * pace[:, None], allowed, HELD)
         turned = deadlock.refused(drive.rules, blocked[None], way, pace, straight, underway=underway, dt=elapsed)
-        return self._within(state, command, first, safety.along(first.normals, own) - first.least)[0], turned[0]
+        return self._within(state, command, first, along(first.normals, own) - first.least)[0], turned[0]
 
     def _within(self, state: Any, command: Array, planes: safety.Planes, room: Array) -> Array:
         """The command, (1, m), scaled down until the middle of the body comes no farther towards any neighbour than `room`, (1, k), and no
@@ -147,7 +147,7 @@ class RobotBody(MeasuredBody):
 
         def moved(command: Array) -> tuple[Array, Array]:
             way = model.body(model.step(state, command, HELD)) - model.body(state)
-            return -safety.along(planes.normals, way), jnp.linalg.norm(way, axis=1)
+            return -along(planes.normals, way), jnp.linalg.norm(way, axis=1)
 
         towards, far = moved(command)
         part = jnp.min(jnp.where(towards > 0.0, room / jnp.where(towards > 0.0, towards, 1.0), 1.0), axis=1, initial=1.0)
