@@ -26,7 +26,7 @@ def _small(picture: Figure, name: str) -> None:
     """Few colours make small files."""
     picture.savefig(TARGET / name, dpi=70)
     with Image.open(TARGET / name) as image:
-        image.convert("RGB").quantize(96).save(TARGET / name, optimize=True)
+        image.convert("RGB").quantize(255).save(TARGET / name, optimize=True)
 
 
 TARGET.mkdir(exist_ok=True)
@@ -35,7 +35,6 @@ for file in sorted((ROOT / "examples").glob("*.yaml")):
     if sys.argv[1:] and name not in sys.argv[1:]:
         continue
     result = escort(file) if name == "escort" else cs.run(str(file), until=UNTIL.get(name))
-    print(result.summary["scenario"], result.summary["status"])
     picture = figures.formation(result)
     assert picture is not None
     _small(picture, f"{name}.png")
