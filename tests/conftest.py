@@ -1,10 +1,19 @@
-"""What holds for every test: strict numerics, a CPU, no windows, the same examples in every run."""
+"""What holds for every test: strict numerics, a CPU, no windows, the same examples in every run.
+
+Compiled programs are kept where the command line keeps them, so that workers, the processes that tests start, and the next run share them.
+"""
 
 import os
+from pathlib import Path
 
 # Before the first import of JAX and matplotlib, and in the environment, so that subprocesses have them too.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["MPLBACKEND"] = "Agg"
+os.environ.setdefault("EQX_ON_ERROR", "nan")  # its error callback would forbid keeping them
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "consat" / "xla"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import hypothesis
 import jax

@@ -19,7 +19,8 @@ from consat.errors import InvalidSettings
 from consat.network.deploy import process
 from consat.network.deploy.process import Circumstances, run_agent
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.helm import PERIOD, VALID
+from consat.network.node.body import VALID
+from consat.network.node.helm import PERIOD
 from consat.network.node.modes import Manner
 from consat.network.node.part import Part, split
 from consat.network.node.station import Station

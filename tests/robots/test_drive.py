@@ -21,20 +21,25 @@ DT = 0.05
 HORSESHOE = [[-1, -1], [1.2, -1], [1.2, 1], [-1, 1], [-1, 0.8], [1, 0.8], [1, -0.8], [-1, -0.8]]
 
 
-def driven(drive: Drive, starts: Any, goals: Any, until: float, paths: Any = None) -> tuple[Any, Any]:
-    """State and memory after so many seconds."""
-    targets = jnp.asarray(goals)
+@functools.cache
+def run_of(drive: Drive, steps: int) -> Any:
+    """So many steps and what came of them, as one program."""
 
     @functools.partial(jax.jit, compiler_options=quick_compilation())
-    def run(state: Any, memory: Any) -> Any:
+    def run(starts: Any, targets: Any, paths: Any) -> Any:
         def body(carry: Any, _: None) -> Any:
             return drive.step(*carry, targets, paths=paths)[:2], None
 
-        return jax.lax.scan(body, (state, memory), length=round(until / drive.dt))[0]
+        state = drive.model.start(starts)
+        state, memory = jax.lax.scan(body, (state, drive.start(state)), length=steps)[0]
+        return state, drive.observed(state, memory)
 
-    state = drive.model.start(jnp.asarray(starts))
-    state, memory = run(state, drive.start(state))
-    return state, drive.observed(state, memory)
+    return run
+
+
+def driven(drive: Drive, starts: Any, goals: Any, until: float, paths: Any = None) -> tuple[Any, Any]:
+    """State and memory after so many seconds."""
+    return run_of(drive, round(until / drive.dt))(jnp.asarray(starts), jnp.asarray(goals), paths)  # type: ignore[no-any-return]
 
 
 def circle(count: int, radius: float) -> np.ndarray:
@@ -72,18 +77,19 @@ def test_out_of_a_horseshoe_and_who_cannot_get_out_is_stuck() -> None:
     assert bool(jnp.all(drive.arrived(state, jnp.asarray(goals))))
     assert int(memory.report.contacts) == int(memory.report.collisions) == 0
     assert float(memory.report.clearance) >= 0.0
-    straight, without = driven(drive, starts, goals, until=25.0)
+    straight, without = driven(drive, starts, goals, until=25.0, paths=jnp.repeat(jnp.asarray(goals)[:, None], paths.shape[1], axis=1))
     assert drive.stuck(straight, without, jnp.asarray(goals)) == [0, 1]
     assert int(without.report.collisions) == 0
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_measured_positions_are_what_counts(noise: float) -> None:
-    starts = circle(6, 1.0)
+def test_measured_positions_are_what_counts() -> None:
+    noise, starts = 0.01, circle(6, 1.0)
     drive = Drive(Point(), 6, 2, DT, noise=noise)
     rng, state = np.random.default_rng(0), drive.model.start(jnp.asarray(starts))
     memory = drive.start(state)
-    step = jax.jit(lambda state, memory, seen: drive.step(state, memory, jnp.asarray(-starts), measured=seen)[:2])
+    step = jax.jit(
+        lambda state, memory, seen: drive.step(state, memory, jnp.asarray(-starts), measured=seen)[:2], compiler_options=quick_compilation()
+    )
     for _ in range(200):
         angle = rng.uniform(0, 2 * np.pi, 6)
         error = noise * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -97,7 +103,7 @@ def test_neighbours_are_the_nearest_while_everybody_moves(count: int) -> None:
     rng = np.random.default_rng(1)
     place = rng.uniform(-3, 3, (count, 2))
     known = candidates(jnp.asarray(place))
-    look = jax.jit(lambda known, place: near(known, place, 8, 1.5))
+    look = jax.jit(lambda known, place: near(known, place, 8, 1.5), compiler_options=quick_compilation())
     rebuilt = 0
     for _ in range(60):
         place = place + 0.05 * rng.normal(size=place.shape)

@@ -33,7 +33,7 @@ def problems(count: int, dimension: int, rows: int, seed: int) -> tuple[np.ndarr
 def test_small_problem_is_solved_as_piqp_does(dimension: int, rows: int) -> None:
     count = 400
     wish, normals, least = problems(count, dimension, rows, seed=dimension)
-    found, there = map(np.asarray, jax.jit(nearest)(wish, normals, least, np.full(count, 1e3)))
+    found, there = map(np.asarray, quickly(nearest)(wish, normals, least, np.full(count, 1e3)))
     assert 0.2 < there.mean() < 0.99
     compared = 0
     for index in range(count):
@@ -56,7 +56,7 @@ def test_small_problem_within_a_ball_is_a_projection(dimension: int) -> None:
     """u is the point of a convex set nearest to w if and only if (w − u)·(v − u) ≤ 0 for all v of the set."""
     count, radius = 400, 0.7
     wish, normals, least = problems(count, dimension, 6, seed=7)
-    found, there = map(np.asarray, jax.jit(nearest)(wish, normals, least, np.full(count, radius)))
+    found, there = map(np.asarray, quickly(nearest)(wish, normals, least, np.full(count, radius)))
     rng = np.random.default_rng(8)
     directions = rng.normal(size=(4000, dimension))
     samples = radius * directions / np.linalg.norm(directions, axis=1)[:, None] * rng.random((4000, 1)) ** (1 / dimension)
@@ -232,11 +232,10 @@ def test_conditions_that_do_not_hold_are_named() -> None:
 def test_who_has_no_plane_limits_the_speed() -> None:
     """Four robots around one that has a plane for the nearest only: it may move as far as half the gap to the second nearest."""
     place = jnp.asarray([[0.0, 0.0], [0.3, 0.0], [-0.32, 0.0], [0.0, 0.5], [0.0, -0.6]])
-    _, around = near(candidates(place), place, 1, 10.0)
-    planes = neighbour_planes(place, None, jnp.full(5, 0.1), around)
+    planes = quickly(lambda place: neighbour_planes(place, None, jnp.full(5, 0.1), near(candidates(place), place, 1, 10.0)[1]))(place)
     np.testing.assert_allclose(planes.slack[0], 0.5 * (0.32 - 0.2), atol=1e-6)
     model = Point(speed=10.0)
-    command, moves = jax.jit(lambda wish: filtered(model, model.start(place), wish, planes, DT))(jnp.asarray([[-9.0, 0.0]] * 5))
+    command, moves = quickly(lambda wish: filtered(model, model.start(place), wish, planes, DT))(jnp.asarray([[-9.0, 0.0]] * 5))
     assert bool(moves[0])
     np.testing.assert_allclose(command[0], [-0.06 / DT, 0.0], atol=1e-4)
 
@@ -245,8 +244,13 @@ def test_planes_of_both_kinds_count() -> None:
     place = jnp.asarray([[0.0, 0.0], [0.4, 0.0]])
     around = Near(jnp.asarray([[1], [0]]), jnp.full(2, jnp.inf))
     size = jnp.full(2, 0.1)
-    robots = neighbour_planes(place, None, size, around)
-    walls = obstacle_planes(place, None, size, map_of([box([-1, 0.15], [1, 1])], 2), 4)
+    wall = map_of([box([-1, 0.15], [1, 1])], 2)
     wish = jnp.asarray([[5.0, 5.0], [0.0, 0.0]])
-    command, _ = jax.jit(lambda wish: filtered(Point(), Point().start(place), wish, joined(robots, walls), 1.0))(wish)
+
+    @quickly
+    def commands(wish: Any) -> Any:
+        planes = joined(neighbour_planes(place, None, size, around), obstacle_planes(place, None, size, wall, 4))
+        return filtered(Point(), Point().start(place), wish, planes, 1.0)
+
+    command, _ = commands(wish)
     np.testing.assert_allclose(command[0], [0.1, 0.05], atol=1e-12)

@@ -13,11 +13,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import consat.errors
+from consat.numerics import quick_compilation
 from consat.robots import Double, Fleet, Point, Quadrotor, Unicycle
 
 DT = 0.05
 MODELS = [Point(), Double(), Unicycle(), Quadrotor()]
 NAMES = ["point", "double", "unicycle", "quadrotor"]
+quickly = functools.partial(jax.jit, compiler_options=quick_compilation())
 every_model = pytest.mark.parametrize("model", MODELS, ids=NAMES)
 
 
@@ -25,9 +27,9 @@ every_model = pytest.mark.parametrize("model", MODELS, ids=NAMES)
 def compiled(model: Any) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
     """Step under a command, command for a velocity, and step of a halt."""
     return (
-        jax.jit(lambda state, command: model.step(state, command, DT)),
-        jax.jit(lambda state, velocity: model.command(state, velocity, DT)),
-        jax.jit(lambda state: model.step(state, model.halt(state, DT), DT)),
+        quickly(lambda state, command: model.step(state, command, DT)),
+        quickly(lambda state, velocity: model.command(state, velocity, DT)),
+        quickly(lambda state: model.step(state, model.halt(state, DT), DT)),
     )
 
 
@@ -79,9 +81,10 @@ def test_one_robot_moves_as_it_does_among_many(model: Any) -> None:
     rng = np.random.default_rng(2)
     state = under_way(model, 5, rng)
     wish = jnp.asarray(rng.normal(size=(5, 2)))
-    whole = model.place(model.step(state, model.command(state, wish, DT), DT))
+    onward = quickly(lambda state, wish: model.place(model.step(state, model.command(state, wish, DT), DT)))
+    whole = onward(state, wish)
     alone = jax.tree.map(lambda leaf: leaf[2:3], state)
-    part = model.place(model.step(alone, model.command(alone, wish[2:3], DT), DT))
+    part = onward(alone, wish[2:3])
     np.testing.assert_allclose(part[0], whole[2], atol=1e-14)
 
 
@@ -91,7 +94,7 @@ def test_lowest_bounds_the_whole_step_and_the_halt_after_it(model: Any) -> None:
     state = under_way(model, 40, rng)
     angle = rng.uniform(0, 2 * np.pi, (40, 6))
     normals = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=2))
-    command = model.command(state, jnp.asarray(rng.normal(size=(40, 2))), DT)
+    command = compiled(model)[1](state, jnp.asarray(rng.normal(size=(40, 2))))
     lowest = np.asarray(model.lowest(state, command, normals, DT))
     reach = np.asarray(model.farthest(state, command, DT))
     start, seen, far = np.asarray(model.place(state)), np.full((40, 6), np.inf), np.zeros(40)
@@ -102,7 +105,7 @@ def test_lowest_bounds_the_whole_step_and_the_halt_after_it(model: Any) -> None:
         far = np.maximum(far, np.linalg.norm(np.asarray(place) - start, axis=1))
 
     allowed = np.asarray(model.size(40, DT) - model.radius)[:, None]  # a unicycle's arc over its chord is in its size
-    inside = model.step(state, command, DT)
+    inside = compiled(model)[0](state, command)
     for part in (0.25, 0.5, 0.75, 1.0):
         look(model.place(model.step(state, command, DT * part)))
     for _ in range(40):
@@ -155,7 +158,7 @@ def test_a_quadrotor_stays_within_its_tube_and_its_tilt(dimension: int) -> None:
     model = Quadrotor()
     rng = np.random.default_rng(6)
     state = model.start(jnp.zeros((30, dimension)))
-    step = jax.jit(lambda state, velocity: model.step(state, model.command(state, velocity, DT), DT))
+    step = quickly(lambda state, velocity: model.step(state, model.command(state, velocity, DT), DT))
     off, tilt = [], []
     for index in range(120):
         if index % 8 == 0:  # to and fro at full speed: the worst that a filter can ask for
@@ -173,7 +176,7 @@ def test_wind_moves_what_flies_and_not_what_stands_on_wheels() -> None:
     wind = jnp.asarray([[1.0, 0.0]])
     for model, drifts in ((Point(), True), (Double(), True), (Unicycle(), False), (Quadrotor(), True)):
         state = model.start(jnp.zeros((1, 2)))
-        step = jax.jit(lambda state, model=model: model.step(state, model.halt(state, DT), DT, wind))
+        step = quickly(lambda state, model=model: model.step(state, model.halt(state, DT), DT, wind))
         for _ in range(20):
             state = step(state)
         assert (abs(float(model.body(state)[0, 0])) > 1e-3 + abs(float(model.offset) if model.__class__ is Unicycle else 0.0)) == drifts
@@ -184,9 +187,9 @@ def test_a_fleet_is_its_kinds_in_the_order_of_the_robots() -> None:
     position = jnp.asarray([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     state = fleet.start(position)
     wish = jnp.asarray([[1.0, 0.2], [0.3, 0.1], [0.5, 0.5], [-0.2, 0.3]])
+    onward = quickly(lambda state: fleet.step(state, fleet.command(state, wish, DT), DT))
     for _ in range(5):
-        command = fleet.command(state, wish, DT)
-        state = fleet.step(state, command, DT)
+        state = onward(state)
     alone = Unicycle(offset=0.08)
     other = alone.start(position[jnp.array([1, 3])])
     for _ in range(5):

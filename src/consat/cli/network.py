@@ -149,6 +149,7 @@ def split(
     "--sensor-timeout", type=click.FloatRange(min=0, min_open=True), default=0.5, show_default=True, metavar="SECONDS",
     help="Without a measurement for so long, command to stand.",
 )  # fmt: skip
+@click.option("--robot", type=click.Choice(["point", "unicycle"]), help="For --sensor stdin: what is commanded; by default the scenario's.")
 @click.option("--position", type=_Position(), help="Where a simulated body is, e.g. 0.5,-1; the scenario's start if not given.")
 @rounds_option
 @until_option
@@ -182,6 +183,8 @@ def agent(
     manner = Manner(
         mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report
     )
+    if around["robot"] is not None and around["sensor"] != "stdin":
+        raise click.UsageError("--robot is commanded by what --sensor stdin measures; a simulated body is a point")
     position = around["position"]
     if position is not None and len(position) != part.team.dimension:
         raise click.UsageError(f"--position has {counted(len(position), 'number')}, but must have {part.team.dimension}")

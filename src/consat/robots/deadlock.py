@@ -93,7 +93,7 @@ def bent(rules: Rules, ahead: Array, pace: Array, top: Array, *, underway: Array
     return jnp.where(underway[:, None], way, aside)
 
 
-def refused(rules: Rules, blocked: Array, ahead: Array, pace: Array, straight: Array, *, underway: Array, dt: float) -> Array:
+def refused(rules: Rules, blocked: Array, ahead: Array, pace: Array, straight: Array, *, underway: Array, dt: float | Array) -> Array:
     """`blocked` after `dt`, given what velocity, (N, d), the filter leaves of the straight way."""
     stuck = underway & (jnp.sum(straight * ahead, axis=1) <= rules.refused * pace)
     return jnp.clip(blocked + dt * jnp.where(stuck, rules.up, -rules.down), 0.0, 1.0)

@@ -115,7 +115,7 @@ def kind_of(model: Model[Any]) -> str:
 
 def model_data(model: Model[Any]) -> dict[str, Any]:
     """A model as a scenario file has it."""
-    return {"kind": kind_of(model)} | {each.name: getattr(model, each.name) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
+    return {"kind": kind_of(model)} | {each.name: _listed(getattr(model, each.name)) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
 
 
 def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
@@ -125,6 +125,8 @@ def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
 
 
 def _listed(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
     return [_listed(each) for each in value] if isinstance(value, tuple) else value
 
 

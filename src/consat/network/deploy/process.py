@@ -33,9 +33,11 @@ from consat.network.node.membership import Membership
 from consat.network.node.modes import Manner, Runner, core_of, runner_of
 from consat.network.node.orders import Order, Orders, heeding_signals
 from consat.network.node.part import Part
+from consat.network.node.pilot import RobotBody
 from consat.network.node.station import Station
 from consat.network.transports import Transport
 from consat.network.transports.faults import Weathered
+from consat.robots.description import asked
 
 NAP: Final = 0.05
 """No wait is longer, s, so that signals and commands are soon seen."""
@@ -53,6 +55,7 @@ class Circumstances:
         delay: (low, high) for which each is held back, s, for trials.
         seed: of loss and delay.
         speed: the most that the body moves, length/s.
+        robot: the kind of robot that is commanded; None for that of the scenario, if any.
         sensor: ``simulated``, or ``stdin``: positions are measured by somebody else and read there.
         sensor_timeout: after so long without a measurement, s, the body is commanded to stand.
         position: where a simulated body is; None for the start in the part.
@@ -68,6 +71,7 @@ class Circumstances:
     delay: tuple[float, float] = (0.0, 0.0)
     seed: int = 0
     speed: float = math.inf
+    robot: str | None = None
     sensor: Literal["simulated", "stdin"] = "simulated"
     sensor_timeout: float = 0.5
     position: tuple[float, ...] | None = None
@@ -104,7 +108,7 @@ def run_agent(part: Part, manner: Manner, around: Circumstances, again: Callable
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     dimension = part.team.dimension
-    measured = MeasuredBody(around.speed, around.sensor_timeout) if around.sensor == "stdin" else None
+    measured = _measured(part, around) if around.sensor == "stdin" else None
     body = SimulatedBody(_start(part, around), around.speed) if measured is None else measured
     reading = around.attached or measured is not None or around.standby
     if part.team.moves and part.epoch is None and manner.mode != "lockstep" and not reading:
@@ -297,6 +301,16 @@ def _warm(core: Embodied) -> None:
     moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
     _, _, look = core.turn(core.begin(core.part.first), *core.empty(), moment)
     core.margin(look.bodies)
+
+
+def _measured(part: Part, around: Circumstances) -> MeasuredBody:
+    """A body that somebody else moves: a robot, if the scenario or the command line names one."""
+    robots = asked(around.robot, None, part.robots, part.team.ids)
+    if robots is None:
+        return MeasuredBody(around.speed, around.sensor_timeout)
+    if math.isfinite(around.speed):
+        raise InvalidSettings("--speed is of bodies that are points; robots have a speed of their own, robots: {speed: ..}")
+    return RobotBody(robots, part.team.dimension, around.sensor_timeout)
 
 
 def _start(part: Part, around: Circumstances) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
 SLACK: Final = 0.5
 """A measurement is believed where the body could be by now, and as far beyond as it moves in so long, s."""
+VALID: Final = 0.5
+"""A command is valid for so long, s: a robot that has got no other by then must stand."""
 CONFIRMED: Final = 5
 """So many measurements on end that agree with each other, but not with the last good one, are believed: the body was moved."""
 
@@ -73,11 +75,15 @@ class Measurement(NamedTuple):
         position: (d,) finite.
         time: when it came, by the agent's clock, s.
         stamp: the sensor's own number for it, which rises; None if it gives none.
+        heading: which way the body looks, rad; None if nobody says.
+        neighbours: (k, d) where others near it are; None if nobody says.
     """
 
     position: np.ndarray
     time: float
     stamp: float | None = None
+    heading: float | None = None
+    neighbours: np.ndarray | None = None
 
 
 class MeasuredBody:
@@ -92,6 +98,8 @@ class MeasuredBody:
         timeout: a body not measured for so long, s, is not known to be anywhere, and stands.
         lag: the time in which it would cover the distance, were there no limit, s.
     """
+
+    valid = VALID
 
     def __init__(self, speed: float = np.inf, timeout: float = np.inf, lag: float = 0.5) -> None:
         self._speed, self._timeout, self._lag = speed, timeout, lag
@@ -123,6 +131,10 @@ class MeasuredBody:
         if distance > self._speed * (elapsed + SLACK):
             return f"it is {distance:.3g} from the last one, {elapsed:.2g} s ago, but the body moves by {self._speed:.3g} a second"
         return None
+
+    def named(self, command: np.ndarray) -> dict[str, Any]:
+        """A command as it is told."""
+        return {"velocity": command.tolist()}
 
     def position(self) -> np.ndarray | None:
         return None if self._good is None else self._good.position

@@ -13,8 +13,6 @@ import numpy as np
 from consat.network.node.body import MeasuredBody
 from consat.network.node.orders import Orders
 
-VALID: Final = 0.5
-"""A command is valid for so long, s: a robot that has got no other by then must stand."""
 PERIOD: Final = 0.1
 """Time between two commands at most, s."""
 
@@ -24,7 +22,7 @@ class Helm:
 
     Args:
         me: the agent.
-        dimension: of a velocity.
+        dimension: of a velocity; as many numbers has each command.
         body: whose position is measured; None for a simulated one.
         timeout: after so long without a measurement, s, the sensor counts as lost.
         write: takes events.
@@ -65,9 +63,9 @@ class Helm:
         self._over = True
         self._command(self._still)
 
-    def _command(self, velocity: np.ndarray) -> None:
+    def _command(self, command: np.ndarray) -> None:
         if self._body is not None:
-            self._log("command", velocity=velocity.tolist(), valid_for=VALID)
+            self._log("command", **self._body.named(command), valid_for=self._body.valid)
 
     def _log(self, event: str, **details: Any) -> None:
         self._write({"event": event, "id": self._me, "t": time.monotonic(), **details})

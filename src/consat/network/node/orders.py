@@ -120,7 +120,7 @@ class Orders:
         except (ValueError, RecursionError):
             return "it is no JSON"
         if isinstance(told, dict) and "position" in told and "command" not in told:
-            return self._measure(line, told["position"], told.get("stamp"))
+            return self._measure(line, told["position"], told.get("stamp"), told)
         order = order_of(told, line[:SHOWN])
         if isinstance(order, str):
             return order
@@ -134,14 +134,23 @@ class Orders:
             return f"{HELD} orders wait already; tell it again later"
         return None
 
-    def _measure(self, line: str, position: Any, stamp: Any) -> str | None:
+    def _measure(self, line: str, position: Any, stamp: Any, order: dict[str, Any]) -> str | None:
         if self._dimension is None:
             return "the position of this agent is simulated; start it with --sensor stdin to measure it"
-        if not (isinstance(position, list) and len(position) == self._dimension and all(map(_is_coordinate, position))):
+        if not _is_place(position, self._dimension):
             return f"position must be a list of {self._dimension} finite numbers"
         if not (stamp is None or _is_coordinate(stamp)):
             return "stamp must be a finite number"
-        new = Measurement(np.array(position, dtype=float), time.monotonic(), None if stamp is None else float(stamp))
+        heading, others = order.get("heading"), order.get("neighbours")
+        if not (heading is None or _is_coordinate(heading)):
+            return "heading must be a finite number, rad"
+        if not (others is None or (isinstance(others, list) and all(_is_place(each, self._dimension) for each in others))):
+            return f"neighbours must be a list of lists of {self._dimension} finite numbers"
+        new = Measurement(
+            np.array(position, dtype=float), time.monotonic(), None if stamp is None else float(stamp),
+            None if heading is None else float(heading),
+            None if others is None else np.array(others, dtype=float).reshape(-1, self._dimension),
+        )  # fmt: skip
         self._measurements.append((line[:SHOWN], new))
         return None
 
@@ -158,6 +167,10 @@ def _lines(descriptor: int) -> Iterator[str]:
         yield from (line[:LONGEST_LINE].decode(errors="replace").strip() for line in lines)
     if rest:
         yield rest.decode(errors="replace").strip()
+
+
+def _is_place(value: Any, dimension: int) -> bool:
+    return isinstance(value, list) and len(value) == dimension and all(map(_is_coordinate, value))
 
 
 def _is_coordinate(value: Any) -> bool:

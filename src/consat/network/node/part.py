@@ -24,6 +24,7 @@ from consat.numerics import float64
 from consat.problem.family import Family
 from consat.problem.objective import Nu
 from consat.problem.team import Agent, Team
+from consat.robots.description import Robots
 from consat.scenario import Scenario, dump
 from consat.scenario.document import LARGEST, Document, decode, read
 from consat.scenario.schema import build
@@ -110,6 +111,7 @@ class Part:
         generation: how often the team has been split anew since it began: agents of other generations are not understood, for what they say
             may travel along other links.
         extent: how far beyond `reach` constraints may lead, length; see `consat.problem.units.Scale`.
+        robots: what its body is, and the public map; None for a point that goes where it wants.
     """
 
     name: str
@@ -131,6 +133,7 @@ class Part:
     epoch: float | None = None
     generation: int = 0
     extent: float = 0.0
+    robots: Robots | None = None
 
     @property
     def nu(self) -> Nu:
@@ -289,9 +292,14 @@ def split(
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
             _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
-            epoch, generation, size.extent,
+            epoch, generation, size.extent, _robot(scenario.robots, agent),
         )  # fmt: skip
     return parts
+
+
+def _robot(robots: Robots | None, agent: str) -> Robots | None:
+    """Its own, and the map."""
+    return None if robots is None else replace(robots, common=robots.own.get(agent, robots.common), own={})
 
 
 def _word(name: str) -> str:
@@ -304,7 +312,7 @@ def write_part(part: Part) -> str:
     Raises:
         InvalidTeam: it has constraints that are Python functions; no file can hold them.
     """
-    scenario = read(dump(part.team, part.settings, part.name), part.me).root
+    scenario = read(dump(part.team, part.settings, part.name, robots=part.robots), part.me).root
     assert scenario is not None
     return write(
         {
@@ -362,14 +370,14 @@ def read_part(text: str, file: str) -> Part:
     if document.faults:
         raise document.invalid()
     assert document.root is not None
-    team, settings, name, *_ = build(Document(file, document.root.value["scenario"]))
+    team, settings, name, robots, _ = build(Document(file, document.root.value["scenario"]))
     if faults := list(_unfit(frame, team, settings)):
         raise document.invalid(faults)
     return Part(
         name or frame.agent, frame.run, frame.agent, frame.listen, frame.length, frame.psi, np.array(frame.center, dtype=float),
         frame.reach, frame.convex, frame.exact, frame.hops, team, settings,
         np.array([frame.first[agent] for agent in team.ids], dtype=float), frozenset(frame.absent), frame.neighbours, frame.epoch,
-        frame.generation, frame.extent,
+        frame.generation, frame.extent, robots,
     )  # fmt: skip
 
 
