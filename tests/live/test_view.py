@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 WEB = Path(__file__).parents[2] / "web"
-BUILT = Path(__file__).parents[2] / "src" / "consat" / "views" / "page.js"
+BUILT = Path(__file__).parents[2] / "src" / "consat" / "views"
 NODE = shutil.which("node") is not None and (WEB / "node_modules" / "esbuild").is_dir()
 
 
-def test_view_is_small_and_loads_nothing_from_elsewhere() -> None:
-    text = BUILT.read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["live.js", "replay.js"])
+def test_view_is_small_and_loads_nothing_from_elsewhere(name: str) -> None:
+    text = (BUILT / name).read_text(encoding="utf-8")
     assert len(text.encode()) <= 100_000
     for word in ("import(", "eval(", "new Function", "http://", "https://", "innerHTML"):
         assert word not in text, word

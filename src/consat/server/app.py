@@ -203,7 +203,7 @@ def page(name: str, host: str) -> tuple[str, str]:
     """The page, and the policy that lets it run what it came with and nothing else."""
     views, own = resources.files("consat.views"), resources.files("consat.server")
     style = "".join((views / each).read_text(encoding="utf-8") for each in ("page.css", "live.css"))
-    script, html = (views / "page.js").read_text(encoding="utf-8"), (own / "live.html").read_text(encoding="utf-8")
+    script, html = (views / "live.js").read_text(encoding="utf-8"), (own / "live.html").read_text(encoding="utf-8")
     hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in (script, style)]
     reach = f"ws://{host} wss://{host}" if re.fullmatch(r"[\w.:\[\]-]+", host) else "'self'"
     policy = (

@@ -1,7 +1,7 @@
 """A run as one HTML file that replays it offline: nothing is loaded, nothing is evaluated, everything lies inside.
 
-``replay.html`` is the page, ``page.css`` its look, ``page.js`` decodes the data and draws; that is built from ``web/``, and the live page
-has it too. The data is JSON; arrays are base64 of little-endian float32.
+``replay.html`` is the page, ``page.css`` its look, ``replay.js`` decodes the data and draws; that is built from ``web/``, as the live
+page's script is. The data is JSON; arrays are base64 of little-endian float32.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def page(result: Result) -> str:
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
     files = resources.files("consat.views")
-    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "page.js", "replay.html"))
+    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "replay.js", "replay.html"))
     data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     summary = result.summary
     status = summary["status"]
