@@ -57,9 +57,9 @@ def check_same(several: dict[str, Any], one: dict[str, Any]) -> None:
             ["--loss", "0.2", "--sleep", "0.1", "--rate", "10", "--speed", "2", "--rounds", "70", "--protocol", "admm"],
             {"loss": 0.2, "sleep": 0.1, "rate": 10, "speed": 2, "rounds": 70, "protocol": "admm"},
         ),
-        (4, ["--rounds", "33", "--protocol", "proximal"], {"rounds": 33, "protocol": "proximal"}),
+        (3, ["--rounds", "33", "--protocol", "proximal"], {"rounds": 33, "protocol": "proximal"}),
     ],
-    ids=["two, with losses and bodies", "four, proximal"],
+    ids=["two, with losses and bodies", "three, proximal"],
 )
 def test_processes_agree_with_one(count: int, options: list[str], how: dict[str, Any], tmp_path: Path) -> None:
     file, team = tmp_path / "lattice.yaml", lattice(6)

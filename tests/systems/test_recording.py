@@ -65,7 +65,7 @@ def test_run_that_was_interrupted_is_taken_up_bit_for_bit(how: dict[str, Any], t
 
 
 def test_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
-    rounds = 20_000
+    rounds = 8_000
     command = [CONSAT, "run", "case-c", "--rounds", str(rounds), "--loss", "0.2", "--every", "5", "--json"]
     once = [*command, "--out", str(tmp_path / "killed"), "--checkpoint", "0.05"]
     process = subprocess.Popen(once, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

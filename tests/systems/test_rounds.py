@@ -268,9 +268,9 @@ def test_agents_without_constraints_or_links_and_alone() -> None:
     assert summary["status"] == "satisfied"
     assert summary["positions"]["idle"] == [7, 8]
     assert summary["agents"]["free"]["margin"] is None
-    # the link to another cluster carries nothing; a and free share x_free and the level: a quadratic of three variables and three numbers,
+    # the link to another cluster carries nothing; a and free share x_free and the level: a quadratic of three variables and four numbers,
     # a proof of two and three, and of the bodies a position, how old it is, and two numbers
-    assert (summary["messages"], summary["floats_sent"]) == (2 * summary["rounds"], 2 * (9 + 3 + 5 + 3 + 5) * summary["rounds"])
+    assert (summary["messages"], summary["floats_sent"]) == (2 * summary["rounds"], 2 * (9 + 4 + 5 + 3 + 5) * summary["rounds"])
 
 
 @pytest.mark.parametrize("dimension", [1, 3])

@@ -82,7 +82,7 @@ AGENT = [
         "12:27: .*: there is no agent 'a2'", "14:25: communication link 1: there is no agent 'a2'"),
     bad("id: a2", "name: a2", r"9:5: agents\[1\]: id is missing", r"9:5: agents\[1\]: there is no key 'name'", "12:27: .*no agent 'a2'",
         "14:25: .*no agent 'a2'"),
-    bad("    start: [3, 1]", "    colour: red", r"6:5: agents\[0\]: there is no key 'colour'; the keys are id, start, constraints$"),
+    bad("    start: [3, 1]", "    colour: red", r"6:5: agents\[0\]: there is no key 'colour'; the keys are id, start, robot, constraints$"),
     bad("start: [3, 1]", "start: 3", "6:12: agent 'a1': start is 3, but must be a list of 2 numbers"),
     bad("start: [3, 1]", "start: [3]", "6:12: agent 'a1': start has 1 entry, but must have 2"),
     bad("start: [3, 1]", "start: [3, x]", "6:12: agent 'a1': start holds 'x'"),

@@ -16,6 +16,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
     "init": ("consat init my-team.yaml", "consat init case-b"),
     "keys": ("consat keys case-b --out keys", "consat keys a1 a2 --out keys --address 192.168.0.7"),
     "launch": ("consat launch case-b --rounds 200", "consat launch case-b --loss 0.1 --delay 0.02,0.05 --out runs/case-b"),
+    "live": ("consat live case-b", "consat live my-team.yaml --no-open --port 8000"),
     "plot": ("consat plot runs/case-b", "consat plot runs/case-b --out figures"),
     "run": (
         "consat run case-b",

@@ -293,7 +293,7 @@ class Rules:
     def chunk(self, tally: Tally) -> int:
         """How many rounds to go before the next look."""
         looks = [at for at in (self.turn, self.least, self.end) if at is not None and at > tally.done]
-        return min(CHUNK, min(looks) - tally.done)
+        return min(CHUNK, min(looks, default=tally.done) - tally.done)
 
     def ending(self, tally: Tally, positions: Callable[[], np.ndarray]) -> Ending | None:
         """Why the run should end now, or None."""
