@@ -32,6 +32,7 @@ from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import vector
+from consat.problem.schedule import Schedule
 from consat.problem.team import Agent, Team
 from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
@@ -45,6 +46,9 @@ from consat.runs.preparation import Prepared, copies_of, robots_of, scenario_of,
 from consat.runs.summary import summarise
 from consat.scenario import Scenario
 from consat.settings import Smoothing
+
+PLACES = frozenset(("center", "vector", "radius", "low", "high"))
+"""Parameters that are lengths: where they are small, a constraint asks nobody to go far."""
 
 
 class Assessment(NamedTuple):
@@ -134,6 +138,7 @@ class Session:
         ready = Prepared.of(scenario.team, settings)
         self._engine = self._built(ready, ready.first(drive=self._body.drive), self._body)
         self._extent = ready.size.extent / ready.size.length
+        self._well_inside = ready.size.reach - float(np.abs(ready.size.center).max(initial=0.0))
         state, chunk = self._engine.carrier.start()
         self._state: Now = state
         self._tally, self._record = Tally(), Memory()
@@ -562,6 +567,10 @@ class Session:
         family = self._engine.ready.team.families[change.family]
         if carrier.world.everyone.interior is None or family.psi not in ADJUSTABLE:
             return
+        if PLACES.issuperset(change.given) and all(
+            not isinstance(value, Schedule) and np.abs(value).max() <= self._well_inside for value in change.given.values()
+        ):
+            return  # what most changes are
         own = {key: np.asarray(array)[[change.member]] for key, array in self._engine.live.parameters[change.family].items()}
         asked = farthest(family.psi, own, np.asarray(size.center)) / size.length
         if asked <= self._extent:
