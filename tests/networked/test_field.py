@@ -218,7 +218,9 @@ ENDS: dict[str, tuple[dict[str, Any], Callable[[Robot], Any], str]] = {
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_whatever_ends_an_agent_its_robot_stands(end: str, robot: Robot) -> None:
+def test_whatever_ends_an_agent_its_robot_stands(end: str, robot: Robot, request: pytest.FixtureRequest) -> None:
+    heard = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored, and rightly so, where the tests were started by nohup
+    request.addfinalizer(lambda: signal.signal(signal.SIGHUP, heard))
     around, act, why = ENDS[end]
     acted: list[bool] = []
 
