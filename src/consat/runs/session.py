@@ -74,15 +74,11 @@ class _Engine(NamedTuple):
         ready: the team when it was built.
         carrier: who carries out the rounds.
         live: the parameters, as arrays that are written to.
-        family: (M,) in which family each constraint is, in the team's order, …
-        member: … and at which place there.
     """
 
     ready: Prepared
     carrier: OneProcess
     live: Live
-    family: np.ndarray
-    member: np.ndarray
 
 
 class Session:
@@ -125,7 +121,7 @@ class Session:
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
             robots=robots_of(robots, obstacles, scenario),
         )  # fmt: skip
-        self._name, self._source = scenario.name, scenario
+        self._name = scenario.name
         settings = settings_of(scenario.settings, self._options, scenario.team)
         kind = self._kind = str(settings.protocol.kind)
         if kind in FLOWS:
@@ -184,7 +180,7 @@ class Session:
     @property
     def protocol(self) -> str:
         """Its kind, such as ``interior-point``."""
-        return str(self._engine.ready.settings.protocol.kind)
+        return self._kind
 
     @property
     def rate(self) -> float:
@@ -478,7 +474,7 @@ class Session:
         return body
 
     def _built(self, ready: Prepared, first: np.ndarray, body: Body) -> _Engine:
-        team, kind = ready.team, str(ready.settings.protocol.kind)
+        team = ready.team
         require_connected(team)
         live = Live.of(team, 1.0 / body.rate, all_of_them=True)
         assert live is not None
@@ -488,11 +484,7 @@ class Session:
         )  # fmt: skip
         choice = Choice.of(team, ready.copies, "all", estimates=False)
         carrier = OneProcess(self._protocol, world, first, self._weather.seed, choice, None)
-        family, member = np.zeros((2, len(team.owner)), dtype=np.int64)
-        for f, each in enumerate(team.families):
-            family[each.number], member[each.number] = f, np.arange(each.size)
-        assert kind in ROUNDS
-        return _Engine(ready, carrier, live, family, member)
+        return _Engine(ready, carrier, live)
 
     def _restructure(self, team: Team) -> None:
         """Go on with another structure; what everybody remembers of what stays is carried over. Nothing happens where that cannot be."""
