@@ -54,7 +54,7 @@ def opened(browser: Browser, url: str, **options: Any) -> Iterator[Tab]:
     found.on("pageerror", lambda error: said.append(str(error)))
     found.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
     found.goto(url)
-    until(found, "consat.agents().length > 0 && consat.round > 2")
+    until(found, "consat.agents().length > 0 && consat.round > 2 && consat.agents().every((each) => consat.where(each))")
     yield found
     context.close()
     assert not [each for each in said if "WebSocket" not in each], said
