@@ -6,6 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 import consat as cs
 
@@ -163,44 +166,89 @@ def test_a_refused_change_leaves_the_session_as_it_was(settled: cs.Session, chan
     assert state_of(settled) == before
 
 
-def test_hundreds_of_good_and_bad_changes_leave_what_a_fresh_session_has() -> None:
-    random, wrong = np.random.default_rng(4), wrong_changes()
-    session = cs.Session(trio()).step(20)
-    goals: dict[str, tuple[list[float], float]] = {"a1": ([2.0, 0.0], 1.0), "a3": ([-2.0, 0.0], 1.0)}
-    joined, refused = False, 0
-    for turn in range(300):
-        kind = random.integers(0, 10)
-        if kind < 4:
-            agent = str(random.choice(["a1", "a3"]))
-            center, radius = (np.array(goals[agent][0]) + random.uniform(-0.05, 0.05, 2)).tolist(), float(random.uniform(0.8, 1.2))
-            goals[agent] = (center, radius)
-            session.change(agent, "goal", center=center, radius=radius)
-        elif kind < 8:
-            before = state_of(session)
-            with pytest.raises(cs.ConsatError):
-                wrong[int(random.integers(len(wrong)))](session)
-            assert state_of(session) == before
-            refused += 1
-        elif turn % 30 == 29:
-            session = session.remove("a4") if joined else session.add(cs.Agent("a4", [cs.near("a3", 2)]), links=["a2", "a3"])
-            joined = not joined
-        session.step(int(random.integers(0, 3)))
-    assert refused > 80
-    if joined:
-        session.remove("a4")
-    session.step(60)
-    expected = cs.Team(
-        [
-            cs.Agent("a1", [cs.within(*goals["a1"], name="goal")], start=[3, 1]),
-            cs.Agent("a2", [cs.near("a1", 3), cs.near("a3", 2)], start=[0, 2]),
-            cs.Agent("a3", [cs.within(*goals["a3"], name="goal")], start=[-3, -1]),
-        ],
-        links=[("a1", "a2"), ("a2", "a3")],
-    )
-    assert cs.dump(session.team) == cs.dump(expected)
-    fresh = cs.Session(expected).step(80)
-    assert session.satisfied == fresh.satisfied
-    assert session.margin == pytest.approx(fresh.margin, abs=0.02)
+HOME = cs.within([0, 0], 6, name="home")
+FOURTH = cs.Agent("a4", [cs.near("a3", 2)], start=[-2, 2])
+
+
+class Changes(RuleBasedStateMachine):
+    """Good and bad changes in any order, beside a plain description of what the team should have become."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.session = cs.Session(trio()).step(20)
+        self.goals: dict[str, tuple[list[float], float]] = {"a1": ([2.0, 0.0], 1.0), "a3": ([-2.0, 0.0], 1.0)}
+        self.joined = self.home = False
+
+    def expected(self) -> cs.Team:
+        agents = [
+            cs.Agent("a1", [cs.within(*self.goals["a1"], name="goal")], start=[3, 1]),
+            cs.Agent("a2", [cs.near("a1", 3), cs.near("a3", 2), *([HOME] if self.home else [])], start=[0, 2]),
+            cs.Agent("a3", [cs.within(*self.goals["a3"], name="goal")], start=[-3, -1]),
+            *([FOURTH] if self.joined else []),
+        ]
+        links = [("a1", "a2"), ("a2", "a3"), *([("a2", "a4"), ("a3", "a4")] if self.joined else [])]
+        return cs.Team(agents, links=links)
+
+    @rule(rounds=st.integers(0, 3))
+    def step(self, rounds: int) -> None:
+        self.session.step(rounds)
+
+    @rule(agent=st.sampled_from(["a1", "a3"]), away=st.tuples(*[st.floats(-0.4, 0.4)] * 2), radius=st.floats(0.8, 1.2))
+    def move_a_goal(self, agent: str, away: tuple[float, float], radius: float) -> None:
+        center = [(2.0 if agent == "a1" else -2.0) + away[0], away[1]]
+        self.goals[agent] = (center, radius)
+        self.session.change(agent, "goal", center=center, radius=radius)
+
+    @rule(agent=st.sampled_from(["a1", "a2", "a3"]), where=st.tuples(*[st.floats(-4, 4)] * 2))
+    def push(self, agent: str, where: tuple[float, float]) -> None:
+        self.session.place(agent, where)
+        assert self.session.positions[self.session.team.ids.index(agent)].tolist() == list(where)
+
+    @rule(change=st.sampled_from(wrong_changes()))
+    def be_refused(self, change: Callable[[cs.Session], Any]) -> None:
+        before = state_of(self.session)
+        with pytest.raises(cs.ConsatError):
+            change(self.session)
+        assert state_of(self.session) == before
+
+    @precondition(lambda self: not self.joined)
+    @rule()
+    def join(self) -> None:
+        self.session.add(FOURTH, links=["a2", "a3"])
+        self.joined = True
+
+    @precondition(lambda self: self.joined)
+    @rule()
+    def leave(self) -> None:
+        self.session.remove("a4")
+        self.joined = False
+
+    @precondition(lambda self: not self.home)
+    @rule()
+    def gain_a_constraint(self) -> None:
+        self.session.add_constraint("a2", HOME)
+        self.home = True
+
+    @precondition(lambda self: self.home)
+    @rule()
+    def lose_a_constraint(self) -> None:
+        self.session.remove_constraint("a2", "home")
+        self.home = False
+
+    @invariant()
+    def is_the_expected_team(self) -> None:
+        assert cs.dump(self.session.team) == cs.dump(self.expected())
+        np.testing.assert_allclose(self.session.margins, cs.margins(self.session.team, self.session.positions), atol=1e-12)
+
+    def teardown(self) -> None:
+        self.session.step(60)
+        fresh = cs.Session(self.expected()).step(80)
+        assert self.session.satisfied == fresh.satisfied
+        assert self.session.margin == pytest.approx(fresh.margin, abs=0.02)
+
+
+TestChanges = Changes.TestCase
+TestChanges.settings = settings(max_examples=8, stateful_step_count=50, deadline=None, derandomize=True)
 
 
 def test_schedules_and_the_time_are_followed_and_can_begin_in_a_session() -> None:

@@ -35,21 +35,24 @@ class Change(NamedTuple):
     given: Mapping[str, Moving]
 
 
-def changes_of(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[Change]:
+def changes_of(
+    team: Team, agent: str, constraint: str, parameters: Mapping[str, Any], now: Sequence[Mapping[str, Any]] | None = None
+) -> list[Change]:
     """What changes when a constraint, or every side of a box, gets other parameters.
 
     Args:
-        team: as it is now.
+        team: whose constraint it is.
         agent: whose constraint it is.
         constraint: its name.
         parameters: as a scenario has them, such as ``center=[3, 1]``.
+        now: the parameters of every family as they are now, if they are not those of the team.
 
     Raises:
         InvalidTeam: no such agent, constraint or parameter, or a value that it cannot have.
     """
     changes = []
-    for number, given in _sides(team, agent, constraint, parameters):
-        f, m = located(team, number)
+    for number, given in _sides(team, agent, constraint, parameters, now or [family.parameters for family in team.families]):
+        f, m = team.slots[number].tolist()
         changes.append(Change(number, f, m, _checked(team, number, team.families[f], given)))
     return changes
 
@@ -99,18 +102,10 @@ def adjusted(team: Team, changes: Sequence[Change]) -> Team:
 
 def place_of(team: Team, agent: str) -> int:
     """The place of an agent. Raises: InvalidTeam: there is no such agent."""
-    found = next((k for k, each in enumerate(team.ids) if each == agent), None)
+    found = team.place.get(agent) if isinstance(agent, str) else None
     if found is None:
         raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(agent, team.ids)}", f"agent {shown(agent)}")])
     return found
-
-
-def located(team: Team, number: int) -> tuple[int, int]:
-    """In which family a constraint is, and at which place there."""
-    for f, family in enumerate(team.families):
-        if len(where := np.flatnonzero(family.number == number)):
-            return f, int(where[0])
-    raise IndexError(number)
 
 
 def named(team: Team, agent: str, constraint: str) -> list[int]:
@@ -130,7 +125,9 @@ def named(team: Team, agent: str, constraint: str) -> list[int]:
     return sides
 
 
-def _sides(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any]) -> list[tuple[int, Mapping[str, Any]]]:
+def _sides(
+    team: Team, agent: str, constraint: str, parameters: Mapping[str, Any], now: Sequence[Mapping[str, Any]]
+) -> list[tuple[int, Mapping[str, Any]]]:
     """Which constraints are changed, and which of their parameters; of a box ``low`` and ``high`` are those of its sides."""
     numbers = named(team, agent, constraint)
     if len(numbers) == 1:
@@ -139,7 +136,7 @@ def _sides(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any
     if unknown := [key for key in parameters if key not in ("low", "high", "weight")]:
         raise InvalidTeam([Fault((), f"there is no parameter {unknown[0]!r}; it has low, high and weight", where)])
     own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
-    limits = {side: parameters.get(side, _parameter(team, k, side)) for side, k in own.items()}
+    limits = {side: parameters.get(side, _parameter(team, k, side, now)) for side, k in own.items()}
     faults: list[Fault] = []
     checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
     if faults:
@@ -151,12 +148,11 @@ def _sides(team: Team, agent: str, constraint: str, parameters: Mapping[str, Any
     ]
 
 
-def _parameter(team: Team, number: int, key: str) -> Moving:
+def _parameter(team: Team, number: int, key: str, now: Sequence[Mapping[str, Any]]) -> Moving:
     """A parameter as it is, with its schedule if it moves."""
-    f, m = located(team, number)
-    family = team.families[f]
-    track = family.tracks.get(key)
-    return (track and track.schedule(m)) or np.asarray(family.parameters[key])[m]
+    f, m = team.slots[number].tolist()
+    track = team.families[f].tracks.get(key)
+    return (track and track.schedule(m)) or np.asarray(now[f][key])[m]
 
 
 def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) -> dict[str, Moving]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -241,6 +241,19 @@ class Team:
     def count(self) -> int:
         """N, the number of agents."""
         return len(self.ids)
+
+    @functools.cached_property
+    def place(self) -> Mapping[str, int]:
+        """The place of every agent."""
+        return {agent: i for i, agent in enumerate(self.ids)}
+
+    @functools.cached_property
+    def slots(self) -> np.ndarray:
+        """(M, 2) in which family each constraint is, and at which place there."""
+        slots = np.zeros((len(self.owner), 2), dtype=np.int32)
+        for f, family in enumerate(self.families):
+            slots[family.number, 0], slots[family.number, 1] = f, np.arange(len(family.number))
+        return slots
 
     @functools.cached_property
     def constraints_per_agent(self) -> np.ndarray:

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consat.certify.certificate import Verdict, bounds
-from consat.certify.optimum import max_min
+from consat.certify.certificate import Verdict, judged
 from consat.certify.reasons import explain
 from consat.engine.carry import Names, carried, robot_placed, robots_carried
 from consat.engine.chunks import CHUNK, Chunk, OneProcess
@@ -25,14 +24,13 @@ from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Body, Now, World, world_of
 from consat.engine.rounds import Tally, driven, known_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam, shown
-from consat.numerics import float64
+from consat.numerics import float64, on_device
 from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, named, place_of
 from consat.problem.constraints.library import ADJUSTABLE, farthest
 from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import vector
-from consat.problem.schedule import Schedule
 from consat.problem.team import Agent, Team
 from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
@@ -241,16 +239,16 @@ class Session:
         """
         if not parameters:
             return self
-        team = self.team
-        changes = changes_of(team, agent, constraint, parameters)
+        team, live = self._engine.ready.team, self._engine.live.parameters
+        changes = changes_of(team, agent, constraint, parameters, live)
         if not is_adjustment(team, changes):
-            new = changed(team, changes)
+            new = changed(self.team, changes)
             if is_structural(team, changes) or self._bends_otherwise(new):
                 self._restructure(new)
                 return self
         for change in changes:
             for key, value in change.given.items():
-                self._engine.live.parameters[change.family][key][change.member] = value
+                live[change.family][key][change.member] = value
             self._reach_out(change)
         self._note_changes({int(team.owner[change.number]) for change in changes})
         return self
@@ -456,9 +454,7 @@ class Session:
             bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
         )  # fmt: skip
         scenario = dataclasses.replace(scenario_of(team), name=self._name)
-        summary = summarise(scenario, ready.settings, ready.schedule, ready.size, trace, full=False)
-        robots = self._options.robots
-        summary |= {"robots": None, "obstacles": None} if robots is None else robots.told
+        summary = summarise(scenario, ready.settings, ready.schedule, ready.size, trace, robots=self._options.robots)
         return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
     def __repr__(self) -> str:
@@ -503,7 +499,7 @@ class Session:
         robots = state.robots
         if robots is not None and self._state.robots is not None and body.drive is not None:
             robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
-        state = state._replace(state=_begun_anew(inner), body=jnp.asarray(place), key=self._state.key, robots=robots)
+        state = state._replace(state=_begun_anew(inner), body=on_device(place), key=self._state.key, robots=robots)
         margins = np.asarray(_margins(engine.carrier.world, state, float(self.round)))
         # from here on nothing can fail
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
@@ -559,9 +555,7 @@ class Session:
         family = self._engine.ready.team.families[change.family]
         if carrier.world.everyone.interior is None or family.psi not in ADJUSTABLE:
             return
-        if PLACES.issuperset(change.given) and all(
-            not isinstance(value, Schedule) and np.abs(value).max() <= self._well_inside for value in change.given.values()
-        ):
+        if PLACES.issuperset(change.given) and all(np.abs(np.asarray(value)).max() <= self._well_inside for value in change.given.values()):
             return  # what most changes are
         own = {key: np.asarray(array)[[change.member]] for key, array in self._engine.live.parameters[change.family].items()}
         asked = farthest(family.psi, own, np.asarray(size.center)) / size.length
@@ -569,7 +563,7 @@ class Session:
             return
         self._extent = asked if family.arity == 1 else self._extent + asked  # apart from a teammate, who may be as far out as that
         everyone, interior = carrier.world.everyone, carrier.world.everyone.interior
-        interior = dataclasses.replace(interior, units=interior.units._replace(extent=jnp.asarray(self._extent)))
+        interior = dataclasses.replace(interior, units=interior.units._replace(extent=on_device(self._extent)))
         carrier.world = dataclasses.replace(carrier.world, everyone=dataclasses.replace(everyone, interior=interior))
 
     def _note_changes(self, owners: Iterable[int]) -> None:
@@ -577,18 +571,18 @@ class Session:
         inner = self._state.state
         if not isinstance(inner, InteriorState):
             return
-        where = np.zeros(len(self._positions))
-        where[list(owners)] = 1.0
-        changes, bound = _raised(inner.memory.changes, inner.memory.bound, where)
-        memory = inner.memory._replace(changes=changes, bound=bound)
+        changes, bound = np.array(inner.memory.changes), np.array(inner.memory.bound)
+        changes[list(owners)] += 1.0
+        bound[list(owners)] = np.inf
+        # as numpy's arrays: the next round takes them along for nothing, where to put them on the device takes a sixth of a small round
+        memory = inner.memory._replace(changes=changes, bound=bound)  # type: ignore[arg-type]
         self._state = self._state._replace(state=inner._replace(memory=memory))
 
 
 @float64
 def assessed(team: Team) -> Assessment:
     """What an observer can prove of a team whose constraints stand still, centrally."""
-    best = max_min(team)
-    found = bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
+    best, found = judged(team)
     lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
     return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
 
@@ -596,12 +590,6 @@ def assessed(team: Team) -> Assessment:
 def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:
     """A team with other agents, and with more links."""
     return Team(agents, [*team.linked, *links], team.dimension, unit=team.unit)
-
-
-@jax.jit
-def _raised(changes: Any, bound: Any, where: Any) -> tuple[Any, Any]:
-    """Counts of changes and bounds, with those of some agents raised and gone."""
-    return changes + where, jnp.where(where > 0, jnp.inf, bound)
 
 
 def _begun_anew(state: Any) -> Any:
@@ -621,13 +609,13 @@ def _body_moved(body: Any, x: Any, row: Any, i: Any, value: Any) -> tuple[Any, A
 def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> Now:
     """With a body somewhere else; own: whether the agent's estimate of its own position goes with it."""
     row = world.own[i]
-    body, x = _body_moved(now.body, now.state.x, row, jnp.asarray(i), jnp.asarray(value))
+    body, x = _body_moved(now.body, now.state.x, row, on_device(i), on_device(value))
     state = now.state
     if own:
         state = state._replace(memory=state.memory._replace(y=x)) if isinstance(state, InteriorState) else state._replace(x=x)
     heard = now.heard
     if heard is not None:
-        heard = heard._replace(position=heard.position.at[row].set(jnp.asarray(value)))
+        heard = heard._replace(position=heard.position.at[row].set(on_device(value)))
     robots = now.robots
     if robots is not None and world.drive is not None:
         robots = robots._replace(state=robot_placed(world.drive.model, robots.state, i, np.asarray(body)))
@@ -636,7 +624,7 @@ def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> 
 
 @jax.jit
 def _margins(world: World, now: Now, round_: Any) -> Any:
-    observer: Objective = world.at(jnp.asarray(round_)).observer
+    observer: Objective = world.at(on_device(round_)).observer
     return observer.agent_margins(now.body)
 
 
