@@ -15,16 +15,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from consat.certify.conic import normalised, units
 from consat.certify.levels import radii, with_tangents
-from consat.certify.optimum import middle
+from consat.certify.optimum import Optimum, max_min, middle
 from consat.certify.quadratics import Expansion, Floats, Ints, expand, shape_of
-from consat.numerics import float64
+from consat.numerics import float64, on_device
 from consat.problem.graphs import clusters
 from consat.problem.objective import Nu, Objective, evaluate, weigh
 from consat.problem.team import Team
@@ -110,9 +109,15 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
     return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, verdict, order, each)
 
 
+def judged(team: Team) -> tuple[Optimum, Certificate]:
+    """The best formation that is found centrally, and what is proven of the team; sharpened where that may not be the best."""
+    best = max_min(team)
+    return best, bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
+
+
 def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Certificate:
     """Certify a large team by a part of it: what bounds the margin of some of the constraints bounds that of all."""
-    values = np.asarray(evaluate(Objective.at_positions(team), jnp.asarray(x)))
+    values = np.asarray(evaluate(Objective.at_positions(team), on_device(x)))
     if not np.isfinite(values).all():
         return Certificate(-np.inf, None, np.zeros(len(values)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
     mine = np.zeros(team.count, dtype=bool)
@@ -175,7 +180,7 @@ class _Proof:
         soft = self.weights(self.model.value, 1.0 / self.psi)
         candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in RUNGS]
         if nu is not None:
-            own = np.asarray(weigh(Objective.at_positions(self.team), jnp.asarray(self.model.at), nu)[1])
+            own = np.asarray(weigh(Objective.at_positions(self.team), on_device(self.model.at), nu)[1])
             candidates.append(normalised(np.where(self.concave, own, 0.0), self.group, self.count))
         if multipliers is not None:
             candidates.append(normalised(np.where(self.concave, multipliers, 0.0), self.group, self.count))

@@ -216,14 +216,12 @@ def _run(
     ready = Prepared.of(team, settings)
     options = keep.options(team, ready.copies, "time" if settings.protocol.kind in FLOWS else "round")
     trace = simulate(ready, **options)
-    summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full)
+    summary = summarise(scenario, settings, ready.schedule, ready.size, trace, full=full, robots=keep.asked.robots)
     summary |= more
     if trace.turned is not None:
         over = f"the links form loops and had not satisfied the team after {trace.turned:.0f} rounds; it went over to a spanning tree"
         summary |= {"route": "tree", "why": over}
     summary["warnings"] += around_loops(summary["route"], trace)
-    machines = keep.asked.robots
-    summary |= {"robots": None, "obstacles": None} if machines is None else machines.told
     if keep.files is not None and jax.process_index() == 0:
         summary["result"] = str(keep.files.directory / RESULT)
         trace = keep.files.finish(options["sink"], trace, team, summary, scenario.text)

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from consat import __version__
 from consat.certify.certificate import bounds
+from consat.numerics import on_device
 from consat.problem.objective import Objective, Schedule, weigh
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.results.trace import Trace
+from consat.robots.description import Robots
 from consat.runs.advice import warnings_of
 from consat.runs.verdicts import verdicts
 from consat.scenario import Scenario
@@ -28,12 +29,15 @@ NEARLY = 1e-3
 """… and so is one within this of it, in ψ, or in the team's unit of ψ where that is less."""
 
 
-def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, full: bool) -> dict[str, Any]:
+def summarise(
+    scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, *, full: bool = False,
+    robots: Robots | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """What ``run --json`` prints (schema consat.run/1)."""
     whole, position = scenario.team, trace.end
     team = whole.at(float(trace.steps[-1]) * (trace.period or 1.0))
     nu = schedule.final
-    margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), jnp.asarray(position), nu))
+    margins, multipliers = map(np.asarray, weigh(Objective.at_positions(team), on_device(position), nu))
     margin = float(margins.min(initial=np.inf))
     certificate = bounds(team, position, nu)
     listed = full or team.count <= MOST_LISTED
@@ -73,7 +77,7 @@ def summarise(scenario: Scenario, settings: Settings, schedule: Schedule, size: 
         ),
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
-    }
+    } | ({"robots": None, "obstacles": None} if robots is None else robots.told)
 
 
 def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:

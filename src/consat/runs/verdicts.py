@@ -12,8 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consat.certify.certificate import bounds
-from consat.certify.optimum import max_min
+from consat.certify.certificate import judged
 from consat.problem.objective import margins
 from consat.problem.team import Team
 
@@ -69,8 +68,7 @@ def certify(team: Team, time: float, x: np.ndarray | None) -> Instant:
     here = team.at(time)
     if x is not None and np.isfinite(x).all() and (lower := float(margins(here, x).min(initial=np.inf))) > 0:
         return Instant(time, "feasible", lower, None)
-    best = max_min(here)
-    found = bounds(here, best.positions, refine=not best.exact, multipliers=best.multipliers)
+    found = judged(here)[1]
     return Instant(time, found.verdict, found.lower, found.upper)
 
 

@@ -140,7 +140,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     if crew.done:  # what it was before is in the margins of the trace; verdicts over time are of a team that is not changed
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
-    summary = summarise(scenario, settings, schedule, size, trace, full) | {"mode": plan.mode, "network": observer.network()}
+    summary = summarise(scenario, settings, schedule, size, trace, full=full) | {"mode": plan.mode, "network": observer.network()}
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
