@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from consat.certify.quadratics import Floats, Ints
-from consat.numerics import Groups, float64
+from consat.numerics import Groups, float64, on_device
 from consat.problem.objective import Objective
 from consat.problem.team import Team
 from consat.problem.units import SHARPNESS, Scale, start_box
@@ -38,9 +38,9 @@ def climb(team: Team, first: Floats, cluster: Ints, size: Scale) -> tuple[Floats
     """
     count = int(cluster.max(initial=-1)) + 1
     objective, groups, agents = Objective.at_positions(team), Groups.of(cluster[team.owner], count), Groups.of(cluster, count)
-    x = jnp.asarray(first)
+    x = on_device(first)
     for rung in LADDER:
-        x = _climb(objective, groups, agents, x, jnp.asarray(rung * SHARPNESS / size.psi), jnp.asarray(REACH * size.length))
+        x = _climb(objective, groups, agents, x, on_device(rung * SHARPNESS / size.psi), on_device(REACH * size.length))
     return np.asarray(x), np.asarray(_margins(objective, groups, x))
 
 

@@ -21,7 +21,7 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy import sparse
 
-from consat.numerics import float64, once
+from consat.numerics import float64, on_device, once
 from consat.problem.constraints.curvature import Curvature, hessians, read_curvatures
 from consat.problem.constraints.domain import HUGE, Extended
 from consat.problem.family import Family
@@ -208,9 +208,9 @@ def _on_device(team: Team) -> list[_Device]:
     return [
         (
             jax.tree_util.Partial(family.psi),
-            jnp.asarray(family.agents),
-            {key: jnp.asarray(value) for key, value in family.parameters.items()},
-            jnp.asarray(family.weight),
+            on_device(family.agents),
+            {key: on_device(value) for key, value in family.parameters.items()},
+            on_device(family.weight),
         )
         for family in team.families
     ]
@@ -230,7 +230,7 @@ def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
     """(M,) weighted ψ at (N, d) positions, −∞ where it is no finite number; and for each family (M_f, arity, d) its gradients, NaN where
     they can't be computed with."""
     total, gradients = np.zeros(len(team.owner)), []
-    for family, (value, gradient) in zip(team.families, _first_order(_on_device(team), jnp.asarray(x)), strict=True):
+    for family, (value, gradient) in zip(team.families, _first_order(_on_device(team), on_device(x)), strict=True):
         total[family.number] = np.asarray(value)
         gradients.append(np.asarray(gradient))
     return total, gradients
@@ -239,7 +239,7 @@ def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
 @float64
 def tangents(team: Team, family: int, arguments: Floats) -> tuple[Floats, Floats]:
     """(M_f,) weighted ψ and (M_f, arity, d) gradients of a family at (M_f, arity, d) arguments of their own; as `values_and_gradients`."""
-    value, gradient = _tangents(_on_device(team)[family], jnp.asarray(arguments))
+    value, gradient = _tangents(_on_device(team)[family], on_device(arguments))
     return np.asarray(value), np.asarray(gradient)
 
 
@@ -252,7 +252,7 @@ def expand(team: Team, at: Floats) -> Expansion:
     for family, device, columns, gradient, constant in zip(
         team.families, _on_device(team), _columns(team), gradients, shape_of(team).hessians, strict=True
     ):
-        hessian = np.asarray(_second_order(*device, jnp.asarray(at))) if constant is None else constant
+        hessian = np.asarray(_second_order(*device, on_device(at))) if constant is None else constant
         whole = Block(family.number, columns, gradient.reshape(columns.shape), hessian)
         block = whole.take(np.asarray(np.isfinite(whole.gradient).all(axis=1)))
         if len(block.number) or not len(whole.number):

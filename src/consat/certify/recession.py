@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
@@ -164,6 +163,8 @@ def _improving(slopes: sparse.csr_array, flat: sparse.csr_array) -> Floats | Non
     columns = slopes.shape[1]
     if not columns:
         return None
+    from scipy.optimize import linprog  # as long to import as a check of a small team takes
+
     gain = np.asarray(slopes.sum(axis=0)).ravel()
     answer = linprog(
         -gain, A_ub=-slopes, b_ub=np.zeros(slopes.shape[0]), A_eq=flat if flat.shape[0] else None,

@@ -21,7 +21,7 @@ from jax import Array
 from consat.engine.chunks import NEVER, Ask, Chosen, Chunk, advance, start
 from consat.engine.round import Now, World
 from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally, later
-from consat.numerics import float64, quick_compilation
+from consat.numerics import float64, on_device, quick_compilation
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending
@@ -182,8 +182,8 @@ class _Shared:
         gains = {name: jnp.asarray([case.gains[name] for case in cases], dtype=float) for name in cases[0].gains}
         return cls(
             _Plan(protocol, structure, places),
-            tuple(jnp.asarray(column[0]) for k, column in enumerate(columns) if k not in places),
-            _Varied(tuple(jnp.asarray(np.stack(columns[k])) for k in places), gains),
+            tuple(on_device(column[0]) for k, column in enumerate(columns) if k not in places),
+            _Varied(tuple(on_device(np.stack(columns[k])) for k in places), gains),
         )
 
 
@@ -213,11 +213,11 @@ class _Pool:
         for place in places:
             self.running[place] = self._lane_at[place] = self.waiting.pop()
         first = np.stack([self._lanes[lane].first for lane in self._lane_at])
-        keys = jax.vmap(jax.random.key)(jnp.asarray([self._lanes[lane].seed for lane in self._lane_at]))
+        keys = jax.vmap(jax.random.key)(on_device(np.array([self._lanes[lane].seed for lane in self._lane_at])))
         self._varied = jax.tree.map(lambda leaf: leaf[self._of_lane[self._lane_at]], self._shared.varied)
         begin, _, choose = _compiled()
         now, chunk = begin(self._shared.plan, self._shared.fixed, self._varied, jnp.asarray(first), keys)
-        self._state = now if self._state is None else choose(jnp.asarray(fresh), now, self._state)
+        self._state = now if self._state is None else choose(on_device(fresh), now, self._state)
         chunk = jax.tree.map(np.asarray, chunk)
         for place in places:
             lane = self.running[place]
@@ -235,7 +235,7 @@ class _Pool:
             rounds[place] = rules.chunk(tally)
             hold[place], most[place] = (HOLD, rules.most) if rules.stop == "satisfied" else (NEVER, NEVER)
             knowing[place] = ENOUGH[rules.stop]
-        ask = Ask(*(jnp.asarray(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
+        ask = Ask(*(on_device(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
         self._state, chunk = _compiled()[1](self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
         chunk, self._positions, self._estimates = jax.tree.map(np.asarray, (chunk, self._state.body, self._state.state.x))
         ended = []

@@ -15,7 +15,7 @@ from jax import Array
 from consat.engine.recording import Choice
 from consat.engine.round import SATISFIED, Now, Seen, World, begin, one_round, see
 from consat.engine.violations import violated
-from consat.numerics import quick_compilation, thorough_compilation
+from consat.numerics import on_device, quick_compilation, thorough_compilation
 from consat.protocols import Rounds
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ class Chosen:
 
     @classmethod
     def of(cls, choice: Choice) -> Chosen:
-        agents = None if choice.everyone else jnp.asarray(choice.agents)
+        agents = None if choice.everyone else on_device(choice.agents)
         copies = np.zeros(0, dtype=np.int32) if choice.copies is None else choice.copies.astype(np.int32)
-        return cls(agents, jnp.asarray(copies), jnp.asarray(choice.watched))
+        return cls(agents, on_device(copies), on_device(choice.watched))
 
     def of_seen(self, seen: Seen) -> Kept:
         position, margin = (values if self.agents is None else values[self.agents] for values in (seen.position, seen.agent_margin))
@@ -280,7 +280,7 @@ class OneProcess:
             self._ways = Ways(world.drive, CHUNK)
 
     def start(self) -> tuple[Now, Chunk]:
-        first, key = jnp.asarray(self._first), jax.random.key(self._seed)
+        first, key = on_device(self._first), jax.random.key(self._seed)
         return _compiled(self._large)[0](self._protocol, self.world, self._chosen, first, key)
 
     def advance(self, state: Now, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[Now, Chunk]:
@@ -290,7 +290,8 @@ class OneProcess:
         hold, most = (NEVER, NEVER) if self._hold is None or streak is None else self._hold
         knowing = 0 if streak is None else self._knowing
         satisfied, near = streak or (0, 0)
-        ask = Ask(*(jnp.asarray(value) for value in (number, count, satisfied, every, hold, most, near, knowing)))
+        asked = (number, count, satisfied, every, hold, most, near, knowing)
+        ask = Ask(*map(np.asarray, asked))  # type: ignore[arg-type]  # numpy's arrays go along with the call at no cost
         return _compiled(self._large)[1](self._protocol, self.world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:
@@ -300,5 +301,5 @@ class OneProcess:
         return stop
 
     def look(self, state: Now, number: int) -> Kept:
-        kept = _compiled(self._large)[2](self.world, self._chosen, state, jnp.asarray(float(number)))
+        kept = _compiled(self._large)[2](self.world, self._chosen, state, on_device(float(number)))
         return Kept(*map(np.array, kept))

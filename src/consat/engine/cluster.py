@@ -18,7 +18,7 @@ from consat.engine.partition import Halo, Share, assign
 from consat.engine.recording import Choice
 from consat.engine.round import Body, Now, Part, Spoken, Weather, World, begin, hear, precision_for, speak, world_of
 from consat.errors import InvalidSettings
-from consat.numerics import quick_compilation
+from consat.numerics import on_device, quick_compilation
 from consat.problem.graphs import hops
 from consat.problem.objective import Nu
 from consat.problem.team import Team
@@ -38,7 +38,7 @@ class _Way(NamedTuple):
 
     @classmethod
     def of(cls, halo: Halo) -> _Way:
-        return cls(jnp.asarray(halo.out), jnp.asarray(halo.into))
+        return cls(on_device(halo.out), on_device(halo.into))
 
 
 class _Book(NamedTuple):
@@ -88,14 +88,14 @@ class ManyProcesses:
         self._protocol, self._hold, self._choice, self._seed = protocol, hold, choice, weather.seed
         self._first, self._agents, self._dimension = first[share.rows], team.count, team.dimension
         world = world_of(share.team, share.copies, nu, size, convex=convex, weather=weather, body=body, partial=True)
-        links = dataclasses.replace(world.everyone.links, metropolis=jnp.asarray(1.0 / (1.0 + share.degree)))
+        links = dataclasses.replace(world.everyone.links, metropolis=on_device(1.0 / (1.0 + share.degree)))
         everyone = dataclasses.replace(
             world.everyone, links=links, hops=hops(team.count, copies.links), precision=precision_for(team.count)
         )
         ours = np.arange(len(share.agents)) < share.mine
         self.world = dataclasses.replace(
             world, everyone=everyone,
-            part=Part(jnp.asarray(share.agents.astype(np.int32)), jnp.asarray(share.pair.astype(np.int32)), jnp.asarray(ours), team.count,
+            part=Part(on_device(share.agents.astype(np.int32)), on_device(share.pair.astype(np.int32)), on_device(ours), team.count,
                       share.pairs),
         )  # fmt: skip
         self._capacity = -(-CHUNK // choice.every) + 1

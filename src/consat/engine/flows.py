@@ -17,7 +17,7 @@ from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink
 from consat.engine.violations import shares, violated
-from consat.numerics import float64, quick_compilation
+from consat.numerics import float64, on_device, quick_compilation
 from consat.problem.objective import Nu, Objective, Schedule
 from consat.problem.team import Team
 from consat.problem.units import scale
@@ -68,7 +68,7 @@ class Problem:
     def of(cls, team: Team, estimates: Estimates, schedule: Schedule, limit: float = np.inf) -> Problem:
         objective = Objective.of(team, lambda family: estimates.rows(family.owner[:, None], family.agents), estimates.count)
         own = (estimates.holder == estimates.position)[:, None].astype(float)
-        return cls(objective, estimates.exchange(), jnp.asarray(own), schedule, jnp.asarray(limit))
+        return cls(objective, estimates.exchange(), on_device(own), schedule, on_device(limit))
 
     def astray(self, state: State) -> Array:
         """Whether a state has diverged."""
@@ -114,9 +114,9 @@ class Observer:
 
     @classmethod
     def of(cls, team: Team, estimates: Estimates, choice: Choice) -> Observer:
-        agents = None if choice.everyone else jnp.asarray(choice.agents)
-        copies = None if choice.copies is None else jnp.asarray(choice.copies.astype(np.int32))
-        return cls(Objective.at_positions(team), jnp.asarray(estimates.own), agents, copies, jnp.asarray(choice.watched))
+        agents = None if choice.everyone else on_device(choice.agents)
+        copies = None if choice.copies is None else on_device(choice.copies.astype(np.int32))
+        return cls(Objective.at_positions(team), on_device(estimates.own), agents, copies, on_device(choice.watched))
 
     def look(self, flow: Flow, problem: Problem, time: Array, state: State) -> Rows:
         """The record of a time."""
@@ -307,7 +307,7 @@ class _Course:
         self.end = len(self.grid) - 1
 
     def start(self) -> tuple[State, Rows]:
-        state = self.flow.start(jnp.asarray(self.first))
+        state = self.flow.start(on_device(self.first))
         rows = self.look(state)
         self.tally.add(rows, self._violated(state))
         return state, rows
@@ -318,7 +318,7 @@ class _Course:
         padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
         if not done and self._overflows(state):
             return state, self.look(state).where(np.zeros(1, dtype=bool)), "diverged"
-        ahead = _advance()(self.flow, self.problem, self.observer, state, jnp.asarray(padded))
+        ahead = _advance()(self.flow, self.problem, self.observer, state, on_device(padded))
         count = int(np.count_nonzero(np.asarray(ahead.reached)[: len(times) - 1]))
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], ahead.seen)._replace(step=times[1 : count + 1])
         if count == len(times) - 1:
@@ -332,7 +332,7 @@ class _Course:
 
     def _overflows(self, state: State) -> bool:
         """Whether even the shortest step would lead astray."""
-        largest = _largest(_rate(self.flow, self.problem, jnp.asarray(self.grid[0]), state))
+        largest = _largest(_rate(self.flow, self.problem, on_device(self.grid[0]), state))
         return not largest * SHORTEST <= float(self.problem.limit)
 
     def _early(self, before: State, ahead: Advance, rows: Rows, every: int) -> tuple[State, Rows, Ending]:
@@ -364,7 +364,7 @@ class _Course:
         return stop
 
     def look(self, state: State) -> Rows:
-        rows = _look(self.flow, self.problem, self.observer, jnp.asarray(self.tally.time), state)
+        rows = _look(self.flow, self.problem, self.observer, on_device(self.tally.time), state)
         return jax.tree.map(np.asarray, rows)
 
     def positions(self, state: State) -> np.ndarray:

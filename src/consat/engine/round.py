@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from consat.engine.live import Live
-from consat.numerics import Groups, pick
+from consat.numerics import Groups, on_device, pick
 from consat.problem.family import distinct
 from consat.problem.graphs import hops
 from consat.problem.objective import Nu, Objective
@@ -62,10 +62,10 @@ class Ends:
         degree = np.bincount(receiver, minlength=count)
         metropolis = 1.0 / (1.0 + np.maximum(degree[receiver], degree[sender]))
         return cls(
-            jnp.asarray(other.astype(np.int32)),
+            on_device(other.astype(np.int32)),
             Groups.of(receiver, count),
-            jnp.asarray(np.repeat(degree.astype(float), block)),
-            jnp.asarray(np.repeat(metropolis, block)),
+            on_device(np.repeat(degree.astype(float), block)),
+            on_device(np.repeat(metropolis, block)),
             block,
         )
 
@@ -515,14 +515,14 @@ def world_of(
     talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
         links=Ends.of(receiver, sender, block, copies.count),
-        length=jnp.asarray(size.length),
+        length=on_device(size.length),
         region=Region.of(size),
         plan=prox.buckets(team, copies.rows, copies.count, convex, live=live is not None) if speaks == "link" else None,
         interior=Interior.of(team, copies, size) if speaks == "pair" else None,
-        nu=Nu(jnp.asarray(nu.alpha), jnp.asarray(nu.beta)),
+        nu=Nu(on_device(nu.alpha), on_device(nu.beta)),
         local=Objective.of(team, lambda family: copies.rows(family.owner[:, None], family.agents), copies.count),
-        holder=jnp.asarray(copies.holder),
-        own=jnp.asarray(copies.own),
+        holder=on_device(copies.holder),
+        own=on_device(copies.own),
         talkers=Groups.of(talker, team.count),
         agents=team.count,
         hops=hops(team.count, copies.links),
@@ -538,19 +538,19 @@ def world_of(
     return World(
         everyone=everyone,
         observer=Objective.at_positions(team),
-        own=jnp.asarray(copies.own),
-        talker=jnp.asarray(talker),
-        pair=jnp.asarray(np.searchsorted(pairs, keys).astype(np.int32)),
-        reach=None if reach is None else jnp.asarray(reach),
+        own=on_device(copies.own),
+        talker=on_device(talker),
+        pair=on_device(np.searchsorted(pairs, keys).astype(np.int32)),
+        reach=None if reach is None else on_device(reach),
         owners=None if reach is None and speaks == "link" else _owners(copies, receiver, sender, block),
-        loss=jnp.asarray(weather.loss),
-        sleep=jnp.asarray(weather.sleep),
+        loss=on_device(weather.loss),
+        sleep=on_device(weather.sleep),
         pairs=len(pairs),
         rough=rough,
         live=live,
         wind=jnp.asarray(body.wind, dtype=float) if body is not None and any(body.wind) else None,
         burst=None if weather.burst is None else jnp.asarray(weather.burst, dtype=float),
-        noise=jnp.asarray(body.noise) if body is not None and body.noise > 0 else None,
+        noise=on_device(body.noise) if body is not None and body.noise > 0 else None,
         drive=None if body is None else body.drive,
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from consat.certify.quadratics import shape_of
+from consat.numerics import on_device
 from consat.problem.objective import Objective
 from consat.problem.team import Team
 
@@ -44,7 +45,7 @@ def shares(team: Team, counts: Any, steps: int) -> np.ndarray:
 
 def shares_of(team: Team, position: np.ndarray) -> np.ndarray:
     """`shares` of a run whose (T, N, d) positions are known."""
-    return shares(team, _count(Objective.at_positions(team), jnp.asarray(watched(team)), jnp.asarray(position)), len(position))
+    return shares(team, _count(Objective.at_positions(team), on_device(watched(team)), on_device(position)), len(position))
 
 
 @jax.jit

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 
 from consat.engine.round import Driven
+from consat.numerics import on_device
 from consat.robots import Drive, Planner, disc
 from consat.robots.obstacles import map_of
 
@@ -61,8 +61,8 @@ class Ways:
             paths[i, : len(path)], paths[i, len(path) :] = path, path[-1]
         waypoint = np.array(robots.memory.waypoint)
         waypoint[anew] = 0
-        memory = robots.memory._replace(waypoint=jnp.asarray(waypoint))
-        return robots._replace(memory=memory, paths=jnp.asarray(paths))
+        memory = robots.memory._replace(waypoint=on_device(waypoint))
+        return robots._replace(memory=memory, paths=on_device(paths))
 
     def _detour(self, i: int, place: np.ndarray, targets: np.ndarray) -> np.ndarray | None:
         """A way of robot i past the map and those whom it sees stand; None where nobody does, or no way leads past them."""

@@ -22,7 +22,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from consat.errors import InvalidSettings, shown
-from consat.numerics import Groups, float64, pick, softmax
+from consat.numerics import Groups, float64, on_device, pick, softmax
 from consat.problem.constraints.domain import HUGE, Extended, extended
 from consat.problem.family import Family
 from consat.problem.team import Team
@@ -150,8 +150,8 @@ class Objective:
             batches=tuple(
                 Batch(
                     jnp.asarray(place, dtype=jnp.int32),
-                    {key: jnp.asarray(value) for key, value in family.parameters.items()},
-                    jnp.asarray(family.weight),
+                    {key: on_device(value) for key, value in family.parameters.items()},
+                    on_device(family.weight),
                     extended(family.psi, family.arity, team.dimension, family.parameters),
                 )
                 for family, place in placed
@@ -260,7 +260,7 @@ def margins(team: Team, positions: ArrayLike | Mapping[str, ArrayLike]) -> np.nd
         InvalidSettings: the positions are not those of this team.
     """
     x = _formation(team, positions)
-    return np.array(_agent_margins(Objective.at_positions(team), jnp.asarray(x)))
+    return np.array(_agent_margins(Objective.at_positions(team), on_device(x)))
 
 
 @jax.jit

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from consat.numerics import float64, once
+from consat.numerics import float64, on_device, once
 from consat.problem.constraints.curvature import expand
 from consat.problem.constraints.domain import HUGE
 from consat.problem.constraints.library import farthest
@@ -74,7 +74,7 @@ class Region(NamedTuple):
 
     @classmethod
     def of(cls, size: Scale) -> Region:
-        return cls(jnp.asarray(size.center), jnp.asarray(size.reach))
+        return cls(on_device(size.center), on_device(size.reach))
 
     def nearby(self, x: jax.Array, convex: bool) -> jax.Array:
         """(n, d) positions: unchanged inside, and from far away brought to its rim, a little farther out the farther they were, keeping
@@ -162,7 +162,7 @@ def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
 
     def look(at: np.ndarray) -> tuple[np.ndarray, ...]:
         value, slope, hessian = (
-            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters), jnp.asarray(at))
+            np.asarray(part) for part in _second_order(family.psi, family.arity, dimension, dict(family.parameters), on_device(at))
         )
         usable = (np.abs(value) <= HUGE) & (np.abs(slope) <= HUGE).all(axis=1) & (np.abs(hessian) <= HUGE).all(axis=(1, 2))
         return usable, *(np.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in (value, slope, hessian))

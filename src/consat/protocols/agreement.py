@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import pick
+from consat.numerics import on_device, pick
 from consat.protocols.base import Solver
 
 NEVER: Final = 1e6
@@ -63,7 +63,7 @@ class Owners(NamedTuple):
         closed = np.zeros(rows, dtype=bool)
         closed[row[direct]] = True
         closed[own] = True
-        return cls(jnp.asarray(own, dtype=jnp.int32), jnp.asarray(direct | ~closed[row]))
+        return cls(jnp.asarray(own, dtype=jnp.int32), on_device(direct | ~closed[row]))
 
 
 class Bodies(NamedTuple):

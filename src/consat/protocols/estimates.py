@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from consat.errors import InvalidSettings
-from consat.numerics import Groups, pick
+from consat.numerics import Groups, on_device, pick
 from consat.problem.family import distinct
 from consat.problem.graphs import clusters, holders, relays, require_connected
 from consat.problem.team import Team
@@ -124,7 +123,7 @@ class Estimates:
     def exchange(self) -> Exchange:
         """The edges as arrays for the device."""
         receiver, sender, block = self.ends()
-        return Exchange(jnp.asarray(sender), Groups.of(receiver, self.count // block), block)
+        return Exchange(on_device(sender), Groups.of(receiver, self.count // block), block)
 
 
 def _everyone(team: Team, cluster: np.ndarray) -> np.ndarray:

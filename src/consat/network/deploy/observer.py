@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from consat.engine.live import Live
@@ -16,6 +15,7 @@ from consat.engine.violations import shares_of
 from consat.network.deploy.commands import Stage
 from consat.network.deploy.fleet import Event
 from consat.network.node.station import Knowledge
+from consat.numerics import on_device
 from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
@@ -252,7 +252,7 @@ def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: 
         rows = which == k
         team, there = stages[k].there()
         live = Live.of(team, 1.0, all_of_them=False)
-        found = _look(Objective.at_positions(team), live, jnp.asarray(position[:, there]), jnp.asarray(times), nu)
+        found = _look(Objective.at_positions(team), live, on_device(position[:, there]), on_device(times), nu)
         margins[np.ix_(rows, there)], smooth[rows] = (np.asarray(each)[rows] for each in found)
     return margins, smooth
 

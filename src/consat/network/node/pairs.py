@@ -23,6 +23,7 @@ from consat.network.node.core import LARGEST
 from consat.network.node.membership import MOST
 from consat.network.node.part import Neighbour, Part
 from consat.network.wire import Numbers
+from consat.numerics import on_device
 from consat.protocols.local.interior import Mail, Proof
 
 INDEFINITE: Final = 1e-6
@@ -127,7 +128,7 @@ class Packing:
                 if numbers:
                     out[row, place] = numbers[0]
                     back[row, numbers] = place
-        return cls(jnp.asarray(out.astype(np.int32)), jnp.asarray(back.astype(np.int32)))
+        return cls(on_device(out.astype(np.int32)), on_device(back.astype(np.int32)))
 
     @property
     def longest(self) -> int:

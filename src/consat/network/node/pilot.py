@@ -17,7 +17,7 @@ from jax import Array
 
 from consat.errors import InvalidSettings
 from consat.network.node.body import MeasuredBody, Measurement
-from consat.numerics import quick_compilation
+from consat.numerics import on_device, quick_compilation
 from consat.robots import Drive, Planner, Unicycle, deadlock
 from consat.robots import filter as safety
 from consat.robots.description import Robots, kind_of
@@ -108,7 +108,7 @@ class RobotBody(MeasuredBody):
         others = self._near[np.argsort(np.linalg.norm(self._near - middle, axis=1))[: SEEN + 1]]
         missing = SEEN + 1 - len(others)
         everybody = np.concatenate([middle[None], others, np.full((missing, len(middle)), LARGEST)])
-        command, blocked = self._steer(everybody, ahead, *(jnp.asarray(value) for value in (self._heading, self._blocked, elapsed)))
+        command, blocked = self._steer(everybody, ahead, *(on_device(value) for value in (self._heading, self._blocked, elapsed)))
         self._blocked = float(blocked)
         return np.array(command)
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from consat.engine.live import Live
 from consat.network.node.part import Part
-from consat.numerics import Groups
+from consat.numerics import Groups, on_device
 from consat.problem.objective import Nu, Objective
 from consat.problem.units import Region
 from consat.protocols.estimates import Estimates
@@ -48,10 +48,10 @@ class OwnLinks:
         degree = np.bincount(row, minlength=part.team.count)
         theirs = np.array([known[neighbour][agent] for neighbour, agent in pairs], dtype=float)
         return cls(
-            jnp.asarray(row),
+            on_device(row),
             Groups.of(row, part.team.count),
             jnp.asarray(degree, dtype=float),
-            jnp.asarray(1.0 / (1.0 + np.maximum(degree[row], theirs))),
+            on_device(1.0 / (1.0 + np.maximum(degree[row], theirs))),
         )
 
     def at(self, rows: Array) -> Array:
@@ -87,11 +87,11 @@ class Alone(LocalSolver):
         me = team.ids.index(part.me)
         return cls(
             links=OwnLinks.of(part),
-            length=jnp.asarray(part.length),
-            region=Region(jnp.asarray(part.center), jnp.asarray(part.reach)),
+            length=on_device(part.length),
+            region=Region(on_device(part.center), on_device(part.reach)),
             interior=_interior(part) if speaks == "pair" else None,
             plan=_plan(part, me) if speaks == "link" else None,
-            nu=Nu(jnp.asarray(part.nu.alpha), jnp.asarray(part.nu.beta)),
+            nu=Nu(on_device(part.nu.alpha), on_device(part.nu.beta)),
             local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
             holder=jnp.zeros(team.count, dtype=np.int32),
             own=jnp.array([me], dtype=np.int32),
@@ -133,9 +133,7 @@ def _interior(part: Part) -> Interior:
     one = team.with_constraints(families, np.zeros_like(team.owner), team.names)
     one.ids = (part.me,)
     copies = Estimates("local", np.zeros_like(number), number, me, none, np.zeros(1, dtype=np.int32), none)
-    units = Units(
-        *(jnp.asarray(each) for each in (part.center, part.length, part.psi, part.reach / part.length, part.extent / part.length))
-    )
+    units = Units(*(on_device(each) for each in (part.center, part.length, part.psi, part.reach / part.length, part.extent / part.length)))
     shared = Shared(talks, pair, np.array([row for shares in rows for row in shares], dtype=int), part.exact)
     return Interior.alone(one, copies, shared, units)
 

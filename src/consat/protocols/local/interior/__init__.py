@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import pick, taken
+from consat.numerics import on_device, pick, taken
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols.estimates import Estimates
@@ -56,11 +56,11 @@ class Interior:
         return cls(
             plan_of(team, copies, shared),
             Units.of(size),
-            jnp.asarray(talker.astype(np.int32)),
-            jnp.asarray(np.searchsorted(keys, listener * team.count + talker).astype(np.int32)),
-            jnp.asarray(owner),
-            jnp.asarray(np.bincount(talker, minlength=team.count)),
-            jnp.asarray(shared.level),
+            on_device(talker.astype(np.int32)),
+            on_device(np.searchsorted(keys, listener * team.count + talker).astype(np.int32)),
+            on_device(owner),
+            on_device(np.bincount(talker, minlength=team.count)),
+            on_device(shared.level),
         )
 
     @classmethod
@@ -69,7 +69,7 @@ class Interior:
         pairs, constraints = len(shared.pairs), sum(family.size for family in team.families)
         talker, nothing = np.zeros(pairs, dtype=np.int32), np.zeros(0, dtype=np.int32)
         owner = np.zeros(constraints, dtype=np.int32)
-        arrays = (jnp.asarray(each) for each in (talker, nothing, owner, np.array([pairs]), shared.level))
+        arrays = (on_device(each) for each in (talker, nothing, owner, np.array([pairs]), shared.level))
         return cls(plan_of(team, copies, shared), units, *arrays)
 
     def silence(self) -> Mail:

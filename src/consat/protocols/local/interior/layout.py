@@ -18,7 +18,7 @@ from jax import Array
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from consat.numerics import laid_out, once
+from consat.numerics import laid_out, on_device, once
 from consat.problem.constraints.curvature import hessians
 from consat.problem.family import Family, distinct
 from consat.problem.graphs import middles
@@ -295,13 +295,13 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
             inside = np.flatnonzero(flat < total)
             place[flat[inside]] = offset + inside
             offset += flat.size
-        where[name] = jnp.asarray(place)
+        where[name] = on_device(place)
     places = size - np.bincount(shared.pair, weights=shared.row < 0, minlength=len(shared.pairs)).astype(np.int64)
     # a quadratic with barrier, level, margin and a count of changes, and a proof with its constant, weight and error
     floats = size * (size + 3) // 2 + 4 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        jnp.asarray(floats), int(size.max(initial=1)), shared.exact and not team.moves,
+        on_device(floats), int(size.max(initial=1)), shared.exact and not team.moves,
     )  # fmt: skip
 
 
@@ -347,16 +347,16 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
         held = slot[copies.rows(family.owner[:, None], family.agents)]  # (M_f, arity)
         slots = np.where(used[:, None, :], np.moveaxis(held[filled], -1, 1), 0)
         kinds.append(Kind(
-            jnp.asarray(slots.astype(np.int32)[None]),
-            {key: jnp.asarray(np.moveaxis(np.asarray(value)[filled], 1, -1)[None]) for key, value in family.parameters.items()},
-            jnp.asarray(np.asarray(family.weight)[filled][None]),
-            jnp.asarray(used[None]),
+            on_device(slots.astype(np.int32)[None]),
+            {key: on_device(np.moveaxis(np.asarray(value)[filled], 1, -1)[None]) for key, value in family.parameters.items()},
+            on_device(np.asarray(family.weight)[filled][None]),
+            on_device(used[None]),
         ))  # fmt: skip
         kept.append(form)
         families.append((number, offset))
         members.append(np.where(used, offset + index, start[-1]).astype(np.int32))
     stacked = np.concatenate([np.zeros((0, A), dtype=np.int32), *members])
-    arrays = [jnp.asarray(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
+    arrays = [on_device(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
     return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept), tuple(families))
 
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from consat.numerics import on_device
 from consat.problem.units import Scale
 from consat.protocols.local.interior.algebra import gram, reduced, solve, spread, times
 from consat.protocols.local.interior.layout import Batch, Kind
@@ -56,11 +57,11 @@ class Units(NamedTuple):
     def of(cls, size: Scale) -> Units:
         """From the natural size of a team."""
         return cls(
-            jnp.asarray(size.center),
-            jnp.asarray(size.length),
-            jnp.asarray(size.typical),
-            jnp.asarray(size.reach / size.length),
-            jnp.asarray(size.extent / size.length),
+            on_device(size.center),
+            on_device(size.length),
+            on_device(size.typical),
+            on_device(size.reach / size.length),
+            on_device(size.extent / size.length),
         )
 
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.numerics import laid_out, once
+from consat.numerics import laid_out, on_device, once
 from consat.problem.constraints.curvature import hessians
 from consat.problem.constraints.domain import Extended, extended
 from consat.problem.family import Family, distinct
@@ -156,7 +155,7 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
         row_start, agent_start = row_start + flat.size, agent_start + one.agents.size
         batches.append(one.batch(convex))
     rows[rows < 0], agents[agents < 0] = row_start, agent_start
-    return Plan(tuple(batches), jnp.asarray(rows), jnp.asarray(agents), team.count)
+    return Plan(tuple(batches), on_device(rows), on_device(agents), team.count)
 
 
 class _Group(NamedTuple):
@@ -290,7 +289,7 @@ class _Made:
     def batch(self, convex: bool) -> Batch:
         known = all(form.slots is not None and form.bend is not None for form in self.forms)
         partial = any(isinstance(form.psi, Extended) for form in self.forms)
-        return Batch(jnp.asarray(self.agents), jnp.asarray(self.rows), self.kinds, self.forms, known, convex, partial)
+        return Batch(on_device(self.agents), on_device(self.rows), self.kinds, self.forms, known, convex, partial)
 
 
 def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callable[..., np.ndarray], count: int, *, live: bool) -> _Made:
@@ -322,11 +321,11 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
         weight = family.weight[index]
         kinds.append(
             Kind(
-                None if slots.ndim == 2 else jnp.asarray(cut(slots.astype(np.int32))),
-                {key: jnp.asarray(cut(np.moveaxis(value[index], 0, -1))) for key, value in family.parameters.items()},
-                None if (weight == 1.0).all() else jnp.asarray(cut(weight.T)),
-                None if used.all() else jnp.asarray(cut(used.T)),
-                jnp.asarray(cut(index.T.astype(np.int32))) if live else None,
+                None if slots.ndim == 2 else on_device(cut(slots.astype(np.int32))),
+                {key: on_device(cut(np.moveaxis(value[index], 0, -1))) for key, value in family.parameters.items()},
+                None if (weight == 1.0).all() else on_device(cut(weight.T)),
+                None if used.all() else on_device(cut(used.T)),
+                on_device(cut(index.T.astype(np.int32))) if live else None,
             )
         )
         psi = extended(family.psi, family.arity, team.dimension, family.parameters)
