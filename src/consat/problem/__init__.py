@@ -1,5 +1,6 @@
-"""What must hold: agents, their constraints and links, and the paper's objective over them.
+"""The problem: agents, their private constraints, the links between agents, and the paper's objective.
 
-In: agents and constraints as a user writes them. Out: a `team.Team`, in which constraints stand in families of one function each, with
-their margins (`objective`), graphs and natural units. Begin with `team`. May import `consat.settings` and `consat.numerics` only.
+Input: agents and constraints as the user writes them. Output: a `team.Team`, which groups the constraints into families with one function
+each. Margins are in `objective`, graphs in `graphs`, natural scales in `units`. Begin with `team`. This package may import
+`consat.settings` and `consat.numerics` only.
 """

@@ -1,4 +1,4 @@
-"""Changes of constraints while a team is at work: which parameters, checked as those of a scenario are."""
+"""Changes of constraint parameters while a team runs. They pass the same checks as the parameters of a scenario."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Change(NamedTuple):
     """New parameters of one constraint.
 
     Attributes:
-        number: of the constraint, in the team's order.
-        family: which family it is in, …
-        member: … and its place there.
-        given: arrays or schedules, by the names of the parameters; ``weight`` may be among them.
+        number: index of the constraint in the team's order.
+        family: index of its family in `Team.families`.
+        member: index of the constraint within its family.
+        given: the new values, by parameter name: arrays or schedules. ``weight`` may be among them.
     """
 
     number: int
@@ -38,17 +38,17 @@ class Change(NamedTuple):
 def changes_of(
     team: Team, agent: str, constraint: str, parameters: Mapping[str, Any], now: Sequence[Mapping[str, Any]] | None = None
 ) -> list[Change]:
-    """What changes when a constraint, or every side of a box, gets other parameters.
+    """The checked changes that give new parameters to one constraint, or to every side of a box.
 
     Args:
-        team: whose constraint it is.
-        agent: whose constraint it is.
-        constraint: its name.
-        parameters: as a scenario has them, such as ``center=[3, 1]``.
-        now: the parameters of every family as they are now, if they are not those of the team.
+        team: the team.
+        agent: id of the agent that owns the constraint.
+        constraint: name of the constraint.
+        parameters: new values, written as in a scenario, such as ``center=[3, 1]``.
+        now: current parameters of each family. If None, those of `team.families`.
 
     Raises:
-        InvalidTeam: no such agent, constraint or parameter, or a value that it cannot have.
+        InvalidTeam: there is no such agent, constraint or parameter, or a value is not allowed.
     """
     changes = []
     for number, given in _sides(team, agent, constraint, parameters, now or [family.parameters for family in team.families]):
@@ -58,7 +58,7 @@ def changes_of(
 
 
 def is_structural(team: Team, changes: Sequence[Change]) -> bool:
-    """Whether a change concerns more than the values of parameters that stay as they are: then rounds are compiled once more."""
+    """Whether a change affects a weight, a schedule, or a parameter that moves with time. Rounds must then be compiled again."""
     return any(
         key == "weight" or isinstance(value, Schedule) or _moves(team.families[change.family], key, change.member)
         for change in changes
@@ -67,12 +67,12 @@ def is_structural(team: Team, changes: Sequence[Change]) -> bool:
 
 
 def is_adjustment(team: Team, changes: Sequence[Change]) -> bool:
-    """Whether only values of parameters change with which no constraint bends otherwise."""
+    """Whether the changes affect only constant values of `ADJUSTABLE` parameters, which leave the curvature of every constraint as is."""
     return not is_structural(team, changes) and all(team.families[change.family].psi in ADJUSTABLE for change in changes)
 
 
 def changed(team: Team, changes: Sequence[Change]) -> Team:
-    """The team with other parameters, weights and schedules of some constraints."""
+    """The team with the changes applied: parameters, weights and schedules. All constraints are checked and grouped again."""
     agents = list(team.agents)
     start = np.searchsorted(team.owner, team.owner)
     for change in changes:
@@ -88,7 +88,7 @@ def changed(team: Team, changes: Sequence[Change]) -> Team:
 
 
 def adjusted(team: Team, changes: Sequence[Change]) -> Team:
-    """The same for an adjustment: the families stay, and nothing that is known of them is asked again."""
+    """The team with an adjustment applied; see `is_adjustment`. The families are kept, so no constraint is checked or traced again."""
     families = list(team.families)
     for change in changes:
         family = families[change.family]
@@ -101,7 +101,7 @@ def adjusted(team: Team, changes: Sequence[Change]) -> Team:
 
 
 def place_of(team: Team, agent: str) -> int:
-    """The place of an agent. Raises: InvalidTeam: there is no such agent."""
+    """The index of an agent in `Team.ids`. Raises: InvalidTeam: there is no such agent."""
     found = team.place.get(agent) if isinstance(agent, str) else None
     if found is None:
         raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(agent, team.ids)}", f"agent {shown(agent)}")])
@@ -109,7 +109,11 @@ def place_of(team: Team, agent: str) -> int:
 
 
 def named(team: Team, agent: str, constraint: str) -> list[int]:
-    """The places of an agent's constraint of this name; of all sides of a box. Raises: InvalidTeam: there is none."""
+    """The indices, in the team's order, of an agent's constraint with this name: one index, or those of all sides of a box.
+
+    Raises:
+        InvalidTeam: there is no such agent or constraint.
+    """
     i = place_of(team, agent)
     low, high = np.searchsorted(team.owner, [i, i + 1])
     names = {team.names[k]: k for k in range(int(low), int(high))}
@@ -128,7 +132,7 @@ def named(team: Team, agent: str, constraint: str) -> list[int]:
 def _sides(
     team: Team, agent: str, constraint: str, parameters: Mapping[str, Any], now: Sequence[Mapping[str, Any]]
 ) -> list[tuple[int, Mapping[str, Any]]]:
-    """Which constraints are changed, and which of their parameters; of a box ``low`` and ``high`` are those of its sides."""
+    """(constraint index, its new parameters) pairs. For a box, ``low`` and ``high`` are distributed over its sides."""
     numbers = named(team, agent, constraint)
     if len(numbers) == 1:
         return [(numbers[0], parameters)]
@@ -149,14 +153,14 @@ def _sides(
 
 
 def _parameter(team: Team, number: int, key: str, now: Sequence[Mapping[str, Any]]) -> Moving:
-    """A parameter as it is, with its schedule if it moves."""
+    """The current value of a parameter of one constraint, or its schedule if it moves with time."""
     f, m = team.slots[number].tolist()
     track = team.families[f].tracks.get(key)
     return (track and track.schedule(m)) or np.asarray(now[f][key])[m]
 
 
 def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) -> dict[str, Moving]:
-    """The values of changed parameters, as arrays or schedules. Raises: InvalidTeam."""
+    """The new values as arrays or schedules. Raises: InvalidTeam: a parameter is unknown or its value is not allowed."""
     where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
     faults: list[Fault] = []
     values: dict[str, Moving] = {}

@@ -1,4 +1,4 @@
-"""Constraints on their way into families: what is wrong with a ψ shows before anything runs, and those that are alike come together."""
+"""Checks ψ of each constraint by tracing it once, before anything runs, and groups constraints that share a function into families."""
 
 from __future__ import annotations
 
@@ -19,12 +19,24 @@ from consat.problem.parameters import Path
 from consat.problem.schedule import Schedule, Track
 
 SUGGESTIONS = 20
-"""Beyond this many faults neither similar ids nor columns within expressions are looked for: in a large team that takes long."""
+"""With this many faults, errors stop suggesting similar ids and locating columns within expressions: in a large team that takes long."""
 
 
 @dataclass
 class Entry:
-    """One constraint on its way into a family."""
+    """One checked constraint that is not yet in a family.
+
+    Attributes:
+        constraint: the constraint as the user made it.
+        owner: index of the agent that owns it.
+        agents: indices of the agents whose positions ψ takes.
+        name: what reports call it.
+        path: its place in the input, for faults.
+        where: the same in words, for faults.
+        values: checked parameters; of a moving parameter, the value at time 0.
+        weight: positive factor on ψ.
+        moving: schedules of the parameters that move with time.
+    """
 
     constraint: Constraint
     owner: int
@@ -37,7 +49,7 @@ class Entry:
     moving: dict[str, Schedule] = field(default_factory=dict)
 
     def take(self, key: str, value: np.ndarray | Schedule) -> None:
-        """Set a parameter that has been checked."""
+        """Store a checked parameter: a constant array or a schedule."""
         if isinstance(value, Schedule):
             self.moving[key] = value
             value = value.at(0.0)
@@ -45,14 +57,17 @@ class Entry:
 
     @property
     def family(self) -> tuple[Any, ...]:
-        """What those of one family have in common."""
+        """Key of the family: the function, the number of positions, and the shapes of the parameters."""
         shapes = tuple((key, value.shape) for key, value in sorted(self.values.items()))
         return same(self.constraint.psi), len(self.agents), shapes
 
 
 def same(psi: Callable[..., Any]) -> Hashable:
-    """What two functions have in common that compute the same: the same code over the same variables. A lambda written in a loop is
-    another object each time, yet one function; constraints that share it are one family. Valid while both functions live."""
+    """A key that is equal for functions with the same code and the same captured objects.
+
+    A lambda written in a loop is a new object on each pass but the same function, so constraints that use it belong to one family. The key
+    contains object ids: it is valid only while the functions exist.
+    """
     if not isinstance(psi, types.FunctionType):
         return psi
     bound = [psi.__globals__, *(psi.__closure__ or ()), *(psi.__defaults__ or ()), *(psi.__kwdefaults__ or {}).values()]
@@ -61,14 +76,14 @@ def same(psi: Callable[..., Any]) -> Hashable:
 
 @float64
 def trace(entries: Iterable[Entry], dimension: int, faults: list[Fault]) -> None:
-    """Trace ψ once a family: whatever a user's function does wrong shows here, before anything runs."""
+    """Trace ψ once per family, so that errors in a user's function are found before anything runs. Adds to `faults`."""
     seen: dict[tuple[Any, ...], Fault | None] = {}
     for entry in entries:
         first = entry.family not in seen
         fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
         if fault is not None and not first:
             written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
-            # Equal expressions may be written differently: each has its own columns.
+            # Expressions of one family may be written differently, so the column of the error differs.
             again = _untraceable(entry, dimension) if written else None
             fault = again or replace(fault, path=(*entry.path, *fault.path[len(entry.path) :]), where=entry.where, offset=0)
         if fault is not None:
@@ -82,7 +97,7 @@ def _untraceable(entry: Entry, dimension: int) -> Fault | None:
 
 
 def _mistake(entry: Entry, dimension: int) -> tuple[str, int]:
-    """What is wrong with ψ, and where in its text; an empty message if nothing is."""
+    """(message, column in the text of ψ) of an error in ψ. The message is empty if ψ is valid."""
     position = jax.ShapeDtypeStruct((dimension,), np.dtype(float))
     try:
         shape = jax.eval_shape(functools.partial(entry.constraint.psi, **entry.values), *(position,) * len(entry.agents))
@@ -100,7 +115,7 @@ def _mistake(entry: Entry, dimension: int) -> tuple[str, int]:
 
 
 def alike(entries: Sequence[Entry]) -> list[Part]:
-    """Constraints that share a family, together."""
+    """Groups entries by family: one `Part` per family."""
     members: dict[tuple[Any, ...], list[Entry]] = {}
     turns: dict[tuple[Any, ...], list[int]] = {}
     for turn, entry in enumerate(entries):

@@ -1,4 +1,4 @@
-"""Constraints in bulk: families with stacked parameters, and ids and names that are made only when somebody asks for them."""
+"""Families: constraints that share one function, with stacked parameters. Also sequences of ids and names that are built on access."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class Family:
     """M constraints that share one function ψ, with stacked parameters; evaluated by one `jax.vmap`.
 
     Attributes:
-        kind: the name errors and reports use.
+        kind: the name that errors and reports use.
         psi: ``psi(*positions, **parameters) -> scalar``.
-        agents: (M, arity) whose positions ψ takes.
-        owner: (M,) whose constraint it is.
-        number: (M,) place in the team's order of constraints, which is by owner.
-        parameters: arrays with leading axis M.
+        agents: (M, arity) indices of the agents whose positions ψ takes.
+        owner: (M,) index of the agent that owns each constraint.
+        number: (M,) index of each constraint in the team's order, which is sorted by owner.
+        parameters: arrays with leading axis M. Moving parameters have their value at time 0.
         weight: (M,) positive factors on ψ.
-        sources: (M,) the texts, if they were written as text expressions, else None.
-        tracks: how parameters move with time; `parameters` are then those at time 0.
+        sources: (M,) the text expressions; None if not all constraints were written as text.
+        tracks: trajectories of the parameters that move with time, by parameter name.
     """
 
     kind: str
@@ -39,7 +39,11 @@ class Family:
     tracks: Mapping[str, Track] = field(default_factory=dict)
 
     def members(self, which: np.ndarray) -> Family:
-        """Some of the constraints, by their places, ascending, or by a mask; numbered as before."""
+        """A subset of the constraints, which keep their `number`.
+
+        Args:
+            which: (M,) boolean mask, or ascending indices.
+        """
         rows = np.flatnonzero(which) if which.dtype == bool else which
         return replace(
             self, agents=self.agents[rows], owner=self.owner[rows], number=self.number[rows], weight=self.weight[rows],
@@ -48,11 +52,11 @@ class Family:
         )  # fmt: skip
 
     def at(self, time: float) -> Family:
-        """The constraints as they are at a time, s, and stay."""
+        """The family with its parameters frozen at `time`, s."""
         return replace(self, parameters=self.parameters_at(time), tracks={}) if self.tracks else self
 
     def parameters_at(self, time: float) -> Mapping[str, np.ndarray]:
-        """Arrays as `parameters`, at a time, s."""
+        """The parameters at `time`, s; arrays as in `parameters`."""
         return {
             **self.parameters,
             **{key: _written(self.parameters[key], track.rows, track.at(time)) for key, track in self.tracks.items()},
@@ -60,7 +64,7 @@ class Family:
 
     @property
     def lasting(self) -> Mapping[str, np.ndarray]:
-        """The parameters, with NaN for those that move: what is proven of these, as of curvature, holds at all times."""
+        """The parameters, with NaN where they move with time. What is proven from these, such as curvature, holds at all times."""
         moving = {key: _written(self.parameters[key], track.rows, np.nan) for key, track in self.tracks.items()}
         return {**self.parameters, **moving}
 
@@ -75,20 +79,20 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Constraints on their way into a family; as there, but not yet numbered.
+    """M constraints to be merged into a `Family` by `assemble`; not yet numbered.
 
     Attributes:
-        kind: see `Family`.
-        psi: likewise.
-        agents: likewise.
-        owner: likewise.
-        parameters: likewise.
-        weight: likewise.
-        names: (M,) what reports call them.
-        sources: likewise.
-        tracks: likewise.
-        turn: (M,) where each was written among those of all parts that say; constraints of one owner keep that order. None: in the
-            order of the parts, after those.
+        kind: as in `Family`.
+        psi: as in `Family`.
+        agents: as in `Family`.
+        owner: as in `Family`.
+        parameters: as in `Family`.
+        weight: as in `Family`.
+        names: (M,) what reports call the constraints.
+        sources: as in `Family`.
+        turn: (M,) position of each constraint in the input, counted over all parts with a `turn`. Constraints of one owner keep this order.
+            Parts without it (None) come after the others, in the order of the parts.
+        tracks: as in `Family`.
     """
 
     kind: str
@@ -104,13 +108,17 @@ class Part:
 
     @property
     def family(self) -> tuple[Any, ...]:
-        """What constraints of one family have in common."""
+        """Key of the family: the function, the number of positions, and the shapes of the parameters."""
         shapes = tuple((key, value.shape[1:]) for key, value in sorted(self.parameters.items()))
         return self.psi, self.agents.shape[1], shapes
 
 
 def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
-    """The families of all parts, the (M,) owners of the constraints in the team's order, which is by owner, and their names."""
+    """Merges parts into families and numbers the constraints by owner.
+
+    Returns:
+        the families, the (M,) owners and the (M,) names, both in the team's order.
+    """
     parts = sorted(parts, key=lambda part: part.turn is None)
     owner = np.concatenate([np.zeros(0, dtype=np.int32), *(part.owner for part in parts)])
     order = _order(parts, owner)
@@ -143,7 +151,7 @@ def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Seq
 
 
 def _tracks(parts: Sequence[Part]) -> dict[str, Track]:
-    """How the parameters of parts that become one family move."""
+    """The tracks of parts that become one family, joined."""
     starts = np.cumsum([0, *(len(part.owner) for part in parts)]).tolist()
     found: dict[str, list[tuple[Track, int]]] = {}
     for part, start in zip(parts, starts, strict=False):
@@ -163,7 +171,7 @@ def _written(values: np.ndarray, rows: np.ndarray, new: Any) -> np.ndarray:
 
 
 def _order(parts: Sequence[Part], owner: np.ndarray) -> np.ndarray | None:
-    """(M,) the constraints by owner, those of one owner as they were written; None if they are in that order."""
+    """(M,) permutation that sorts the constraints by owner and then by `turn`; None if they are sorted already."""
     turns = [part.turn for part in parts if part.turn is not None]
     first = np.argsort(np.concatenate(turns)) if turns else np.zeros(0, dtype=np.intp)
     order = np.concatenate([first, np.arange(len(first), len(owner))])
@@ -176,7 +184,11 @@ def _joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def distinct(keys: np.ndarray) -> np.ndarray:
-    """The different ones among integers, sorted; for millions of them several times as fast as `numpy.unique`."""
+    """The distinct integers, sorted. For millions of keys several times as fast as `numpy.unique`.
+
+    Args:
+        keys: (K,) integers.
+    """
     rising = np.all(keys[1:] >= keys[:-1])
     ordered = keys if rising else np.sort(keys)
     new = np.ones(len(ordered), dtype=bool)
@@ -185,11 +197,11 @@ def distinct(keys: np.ndarray) -> np.ndarray:
 
 
 class Texts(Sequence[str]):
-    """Texts that are made when asked for; compares equal to any sequence of the same ones."""
+    """A sequence of texts that are built on access. Equal to any sequence with the same texts."""
 
     @abstractmethod
     def text(self, index: int) -> str:
-        """The text at `index`, which is in range."""
+        """The text at `index`, which the caller has checked to be in range."""
 
     @overload
     def __getitem__(self, index: int) -> str: ...
@@ -217,7 +229,7 @@ class Texts(Sequence[str]):
 
 
 class Joined(Texts):
-    """Several sequences one after the other."""
+    """Concatenation of several sequences."""
 
     def __init__(self, parts: Iterable[Sequence[str]]) -> None:
         self.parts = tuple(parts)
@@ -236,7 +248,7 @@ class Joined(Texts):
 
 
 class Chosen(Texts):
-    """A sequence in another order; None keeps it."""
+    """Selected entries of a sequence: `of[order[0]]`, `of[order[1]]`, …; all of them if `order` is None."""
 
     def __init__(self, of: Sequence[str], order: np.ndarray | None) -> None:
         self.of, self.order = of, order
@@ -249,7 +261,7 @@ class Chosen(Texts):
 
 
 class Repeated(Texts):
-    """One text so many times."""
+    """One text, repeated `count` times."""
 
     def __init__(self, each: str, count: int) -> None:
         self.each, self.size = each, count
@@ -262,7 +274,7 @@ class Repeated(Texts):
 
 
 class Counted(Texts):
-    """A stem with a number from 1 on: a1, a2, …"""
+    """A stem followed by a number from 1 to `count`: a1, a2, …"""
 
     def __init__(self, stem: str, count: int) -> None:
         self.stem, self.size = stem, count
@@ -274,7 +286,7 @@ class Counted(Texts):
         return f"{self.stem}{index + 1}"
 
     def find(self, text: object) -> int | None:
-        """The place of a text, if it is one of these."""
+        """The index of a text in this sequence; None if it is not in it."""
         if not isinstance(text, str) or not text.startswith(self.stem):
             return None
         digits = text[len(self.stem) :]
@@ -283,13 +295,13 @@ class Counted(Texts):
 
 
 class Derived(Texts):
-    """Names made of a stem, the other agents read, and a number where they would repeat.
+    """Names of M constraints: a stem, the other agents that ψ reads, and a number if the name would repeat, as in ``near(a2) #2``.
 
     Args:
-        stem: what the user calls them, or their kind.
-        ids: of the team; None if the others have no place in the name.
-        others: (M, k) the other agents.
-        rank: (M,) how many of the same name its owner has before; None if none.
+        stem: the name that the user gave, or the kind.
+        ids: ids of the team; None to leave the other agents out of the name.
+        others: (M, k) indices of the agents read besides the owner.
+        rank: (M,) number of earlier constraints of the same owner with the same name; None if no name repeats.
     """
 
     def __init__(self, stem: str, ids: Sequence[str] | None, others: np.ndarray, rank: np.ndarray | None) -> None:

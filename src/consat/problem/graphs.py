@@ -1,6 +1,6 @@
-"""Task graph, clusters and communication graph (paper, section IV-A), and who must hold whose position (design, local estimates).
+"""Task graph, clusters and communication graph (paper, section IV-A), and which agent holds an estimate of which position.
 
-Everything works on arrays of edges; `task_graph` and `communication_graph` give the same as networkx graphs over ids.
+All functions work on arrays of edges. `task_graph` and `communication_graph` return networkx graphs over ids.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def task_edges(team: Team) -> np.ndarray:
-    """Edges (i, j) of the task graph: some ψ of i reads x_j; (i, i) where some ψ of i reads x_i alone.
+    """Edges of the task graph: (i, j) if some ψ of i reads x_j; (i, i) if some ψ of i reads x_i alone.
 
     Returns:
         (E, 2) int32, sorted, each edge once.
@@ -31,7 +31,7 @@ def task_edges(team: Team) -> np.ndarray:
 
 
 def _reads(team: Team) -> np.ndarray:
-    """The edges of the task graph, in any order and as often as there are constraints for them; (E', 2) int32."""
+    """(E', 2) int32 edges of the task graph, unsorted, one for each constraint and position read: edges may repeat."""
     edges = [np.zeros((0, 2), dtype=np.int32)]
     for family in team.families:
         for slot in range(family.arity):
@@ -44,21 +44,21 @@ def clusters(team: Team) -> np.ndarray:
     """The maximal dependency cluster of each agent: the weakly connected components of the task graph.
 
     Returns:
-        (N,) int32 labels from 0, in the order of their first agents.
+        (N,) int32 labels from 0; clusters are numbered by their first agent.
     """
     return _components(_reads(team), team.count)
 
 
 def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
-    """The links inside a cluster; (L', 2) int32."""
+    """(L', 2) int32 links whose two ends are in the same cluster."""
     return team.links[cluster[team.links[:, 0]] == cluster[team.links[:, 1]]]
 
 
 def disconnected(team: Team) -> list[list[list[str]]]:
-    """The clusters whose agents cannot reach one another (Assumption 1): neither over the links inside them nor through `relays`.
+    """The clusters that violate Assumption 1: they are connected neither by the links inside them nor through `relays`.
 
     Returns:
-        for each such cluster its parts, connected by links inside it, each a list of ids.
+        for each such cluster a list of its connected parts; each part is a list of ids.
     """
     cluster = clusters(team)
     part, broken = _broken(team, cluster)
@@ -70,7 +70,7 @@ def disconnected(team: Team) -> list[list[list[str]]]:
 
 
 def _broken(team: Team, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) which agents reach one another over links inside their cluster, and the clusters that fall into several such parts."""
+    """(N,) label of the connected part of each agent, over links inside clusters only; and the labels of clusters with several parts."""
     part = _components(cluster_links(team, cluster), team.count)
     first = np.full(cluster.max() + 1, -1)
     first[cluster[::-1]] = part[::-1]
@@ -78,17 +78,17 @@ def _broken(team: Team, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def relays(team: Team, cluster: np.ndarray) -> dict[int, set[int]]:
-    """Who passes messages between the parts of a cluster that the links inside it leave in pieces.
+    """Relay agents that connect the parts of a cluster which its own links leave disconnected.
 
-    Only agents that no constraint has to do with, neither as its owner nor as one that it reads, stand in for a cluster that is not their
-    own: they hold copies of its positions, and add nothing.
+    Only agents without any role in a constraint (neither owner nor read) can be relays. A relay holds estimates of the positions of the
+    cluster and adds no constraint to it.
 
     Args:
         team: the team.
         cluster: (N,) as `clusters` returns.
 
     Returns:
-        for each cluster that such agents join, the agents: few, though not always the fewest.
+        relay agents by cluster, for each cluster that relays connect. The set is small, but not always minimal (Steiner heuristic).
     """
     _, broken = _broken(team, cluster)
     free = (np.bincount(cluster)[cluster] == 1) & (team.constraints_per_agent == 0)
@@ -105,7 +105,11 @@ def relays(team: Team, cluster: np.ndarray) -> dict[int, set[int]]:
 
 
 def require_connected(team: Team) -> None:
-    """Raises: InvalidTeam: where a cluster is not connected by links, naming its parts and a link that would join them."""
+    """Check Assumption 1: every cluster is connected by links, if need be through `relays`.
+
+    Raises:
+        InvalidTeam: a cluster is not connected. The message names its parts and a link that would join them.
+    """
     faults = []
     for parts in disconnected(team):
         shown = " and ".join("{" + ", ".join(part[:5]) + (", …" if len(part) > 5 else "") + "}" for part in parts[:4])
@@ -118,12 +122,13 @@ def require_connected(team: Team) -> None:
 
 
 def hops(count: int, links: np.ndarray) -> int:
-    """How many links a message crosses, at most, between two agents of a component: found by searching from an agent far out, and then from
-    the one farthest from it, which is exact on trees and close elsewhere.
+    """Diameter of the graph in links: the largest over its components.
+
+    Two breadth-first searches: one from any agent, one from the agent farthest from it. Exact on trees, a lower bound on other graphs.
 
     Args:
-        count: N.
-        links: (L, 2).
+        count: N, the number of agents.
+        links: (L, 2) pairs of agents.
     """
     labels = _components(links, count)
     starts = np.unique(labels, return_index=True)[1]
@@ -132,13 +137,17 @@ def hops(count: int, links: np.ndarray) -> int:
         depth, order = _depths(links, count, starts)
         longest = max(longest, int(depth.max(initial=0)))
         starts = np.zeros(len(starts), dtype=np.intp)
-        starts[labels[order]] = order  # the last one stays: the deepest of its component
+        starts[labels[order]] = order  # the last write wins: the deepest agent of each component
     return longest
 
 
 def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many links each agent, in the order of a breadth-first search, is from the start in its component; and that order."""
-    # one search from all starts, as if they hung on one more agent
+    """Breadth-first search from one start per component.
+
+    Returns:
+        (N,) distances in links, in the order of the search, and (N,) the agents in that order.
+    """
+    # one search for all components: a virtual agent, number `count`, is linked to every start
     here = np.concatenate([links[:, 0], links[:, 1], np.full(len(starts), count, dtype=links.dtype)])
     there = np.concatenate([links[:, 1], links[:, 0], starts.astype(links.dtype)])
     graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(count + 1, count + 1)).tocsr()
@@ -149,18 +158,18 @@ def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarr
     above[0] = 0
     depth = np.ones(len(order), dtype=np.int32)
     depth[0] = 0
-    while above.any():  # twice as far up each time, so that a chain of a million takes twenty turns
+    while above.any():  # pointer doubling: a chain of a million agents takes twenty passes
         depth += depth[above]
         above = above[above]
     return depth[1:] - 1, order[1:]
 
 
 def middles(count: int, links: np.ndarray) -> np.ndarray:
-    """(K,) for each component an agent from which no other is far: the middle of a longest path; exact on trees and close elsewhere.
+    """(K,) a central agent of each component: the middle of a longest path. Exact on trees, approximate on other graphs.
 
     Args:
-        count: N.
-        links: (L, 2).
+        count: N, the number of agents.
+        links: (L, 2) pairs of agents.
     """
     labels = _components(links, count)
     starts, far = np.unique(labels, return_index=True)[1], np.zeros(count, dtype=np.int64)
@@ -169,17 +178,19 @@ def middles(count: int, links: np.ndarray) -> np.ndarray:
         if turn:
             far[order] = np.maximum(far[order], depth)
         starts = np.zeros(len(starts), dtype=np.intp)
-        starts[labels[order]] = order  # the last one stays: the deepest of its component
+        starts[labels[order]] = order  # the last write wins: the deepest agent of each component
     order = np.lexsort((np.arange(count), far, labels))
     return order[np.unique(labels[order], return_index=True)[1]]
 
 
 def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
-    """Who holds a copy of whose position under local estimates: i holds x_j if some ψ of i reads x_j, j holds its own, and relays
-    hold it where the links among these alone would leave them in pieces: agents of the same cluster or, where that has none, `relays`.
+    """Which agent holds an estimate of which position, under local estimates.
+
+    Agent i holds x_j if some ψ of i reads x_j; agent j holds its own. If the links among the holders of a position do not connect them,
+    further agents hold it too: agents of the same cluster or, where these cannot connect them, `relays`.
 
     Args:
-        team: whose clusters are connected.
+        team: a team whose clusters are connected; see `require_connected`.
         cluster: (N,) as `clusters` returns.
 
     Returns:
@@ -192,7 +203,10 @@ def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
 
 
 def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.ndarray]:
-    """Extra (holder, position) pairs. Positions whose readers are all linked to their owner need none, and cost no loop."""
+    """Additional (holder, position) pairs that connect the holders of a position.
+
+    Positions whose readers are all linked to their owner need none; the loop skips them.
+    """
     count, links = team.count, cluster_links(team, cluster)
     foreign = pairs[pairs[:, 0] != pairs[:, 1]]
     known = _keys(links, count)  # sorted, as links are
@@ -212,15 +226,17 @@ def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.
 
 
 def _among(team: Team, cluster: np.ndarray, c: int, joining: set[int]) -> np.ndarray:
-    """The links among the agents of a cluster and those that join its parts."""
+    """(L', 2) links among the agents of cluster `c` and the relays `joining` it."""
     allowed = cluster == c
     allowed[list(joining)] = True
     return team.links[allowed[team.links].all(axis=1)]
 
 
 def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> set[int]:
-    """Agents to add so that `root` and `wanted` are connected: again and again the shortest path from what is joined to the nearest
-    that is not (Takahashi, Matsuyama 1980; at most twice the shortest tree)."""
+    """Agents to add so that `root` and `wanted` are connected: an approximate Steiner tree (Takahashi, Matsuyama 1980).
+
+    Repeatedly adds the shortest path from the tree to the nearest wanted agent. The tree is at most twice as long as the shortest.
+    """
     joined, added, missing = {root}, set[int](), set(wanted)
     while missing:
         parent: dict[int, int] = dict.fromkeys(joined, -1)
@@ -243,7 +259,7 @@ def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> s
 
 
 def task_graph(team: Team) -> nx.DiGraph:
-    """The task graph over ids, with self-edges."""
+    """The task graph as a networkx graph over ids, with self-edges."""
     import networkx as nx
 
     graph = nx.DiGraph()
@@ -253,7 +269,7 @@ def task_graph(team: Team) -> nx.DiGraph:
 
 
 def communication_graph(team: Team) -> nx.Graph:
-    """The communication graph over ids."""
+    """The communication graph as a networkx graph over ids."""
     import networkx as nx
 
     graph = nx.Graph()

@@ -1,15 +1,15 @@
-"""Groups: many agents alike, with constraints that refer to one another by relation rather than by name.
+"""Groups: many similar agents, whose constraints name other agents by relation rather than by id.
 
-A member is known by its place in the group, from 0; its id is the group's name and that place + 1. What a constraint says of the agent it
-reads may be
+A member has an index in the group, from 0; its id is the name of the group followed by index + 1. The argument ``agent`` of a constraint
+may be
 
-* a text: that agent of the team, the same for all members;
-* a whole number: so many places further along the group, ``-1`` being the one ahead; round the end, if the group is a ring;
-* a list of them, one an axis: so many steps along each axis of a grid;
-* ``{"nearest": k}``: the k members whose places are nearest, a constraint for each;
-* an array of whole numbers: the members at these places, one for each constraint.
+* a text: the agent with this id, the same for all members;
+* an integer: an offset of the index, such as ``-1`` for the member ahead; in a ring the offset wraps around;
+* a list of integers, one per axis: an offset along each axis of a grid;
+* ``{"nearest": k}``: the k members with the nearest places, with one constraint for each;
+* an array of integers: the indices of the members to read, one for each constraint.
 
-Members to whom such a relation leads nowhere (the first has nobody ahead) go without.
+A member for which the relation points to nobody gets no constraint: the first member has nobody ahead.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ Ints = NDArray[np.int64]
 
 SHAPES = ("line", "ring", "grid", "random")
 OTHER = "other"
-"""In a group's expression: the agent that ``agent`` tells of."""
+"""In a text expression of a group: the agent that the argument ``agent`` selects."""
 SELF = "self"
-"""In a group's expression: the member itself."""
+"""In a text expression of a group: the member that owns the constraint."""
 PLACE = "place"
-"""As a centre: the member's own place; as a displacement: as its place lies to the other's."""
+"""As a centre: the place of the member. As a displacement: the place of the member minus that of the other agent."""
 ACROSS = "across"
-"""As a centre: the place across the middle of the group from the member's own."""
+"""As a centre: the place of the member, mirrored at the middle of the group."""
 MOST = 2**27
-"""Members at most; copies and links are counted by int32."""
+"""Largest number of members: estimates and links are indexed by int32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Each:
-    """A constraint of a group, and who has it; see `each`."""
+    """A constraint and the members of the group that own it; see `each`."""
 
     constraint: Any
     of: Any = None
@@ -55,29 +55,29 @@ def each(constraint: Any, *, of: Any = None, agent: Any = None) -> Each:
     """A constraint for some members of a group.
 
     Args:
-        constraint: what `consat.within` and its like return. A parameter may be an array with one value for each member that has the
-            constraint, a centre or displacement may be ``"place"``, and a centre ``"across"``.
-        of: who has it: ``"first"``, ``"last"``, an id, a list of ids, ``{"every": k}`` (every k-th, on a grid along every axis), or an
-            array of places in the group; all, if None.
-        agent: for an expression, whom ``other`` means in it; see `consat.problem.groups`. ``self`` is the member.
+        constraint: what `consat.within` and the other factories return. A parameter may be an array with one value for each member that
+            owns the constraint. A centre may also be ``"place"`` or ``"across"``, and a displacement ``"place"``.
+        of: the members that own it: ``"first"``, ``"last"``, an id, a list of ids, ``{"every": k}`` (each k-th member; on a grid along each
+            axis), or an array of indices in the group. If None, all members.
+        agent: for a text expression, the agent that ``other`` stands for; see `consat.problem.groups`. ``self`` is the owner.
     """
     return Each(constraint, of, agent)
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Many agents alike: `count` of them, called name1, name2, …
+    """Many similar agents, with ids name1, name2, …
 
     Attributes:
-        name: what their ids begin with.
-        count: how many.
-        constraints: of every member; `each` gives one to some of them.
-        shape: how their places lie: on a ``line`` or ``ring``, on a square ``grid``, or at ``random`` with one place to each
-            spacing^d; around the origin.
-        spacing: between neighbouring places, length.
-        scatter: how far from its place a member starts on each axis, at most, length; None: starts know nothing of places.
-        start: (count, d) where they start instead.
-        seed: of random places.
+        name: prefix of the ids.
+        count: number of members.
+        constraints: constraints of every member; use `each` for those of some members.
+        shape: arrangement of the places around the origin: ``line``, ``ring``, ``grid`` (square), or ``random`` (one place per volume
+            spacing^d).
+        spacing: distance between neighbouring places, length.
+        scatter: largest distance on each axis between the start of a member and its place, length. If None, starts do not depend on places.
+        start: (count, d) given start positions, length, which override `scatter`.
+        seed: seed of the ``random`` places.
     """
 
     name: str
@@ -94,10 +94,10 @@ class Layout(NamedTuple):
     """The places of a group.
 
     Attributes:
-        places: (N, d).
-        steps: (N, d) the coordinates of each member on the grid; (N, 1) its place along a line.
-        sides: how far these go on each axis.
-        ring: whether the last is followed by the first.
+        places: (N, d) positions, length.
+        steps: (N, d) integer grid coordinates of each member; (N, 1) its index if the shape is no grid.
+        sides: number of grid coordinates on each axis.
+        ring: whether offsets wrap around from the last member to the first.
     """
 
     places: NDArray[np.floating]
@@ -107,7 +107,7 @@ class Layout(NamedTuple):
 
 
 def layout(group: Group, dimension: int) -> Layout:
-    """Where the members of a group that has no faults belong."""
+    """The places of the members. The group must have no faults; see `faults_of`."""
     count, along = group.count, np.arange(group.count)
     places = np.zeros((count, dimension))
     if group.shape == "grid":
@@ -127,7 +127,7 @@ def layout(group: Group, dimension: int) -> Layout:
 
 
 def _along_a_curve(places: NDArray[np.float64]) -> Ints:
-    """(N,) where places come along a Morton curve, so that neighbours in space are neighbours in memory, too."""
+    """(N,) Morton codes of the places. Sorting by them makes neighbours in space neighbours in memory."""
     dimension = places.shape[1]
     bits = min(20, 62 // dimension)
     low, high = places.min(axis=0), places.max(axis=0)
@@ -140,7 +140,7 @@ def _along_a_curve(places: NDArray[np.float64]) -> Ints:
 
 
 def faults_of(group: Group, path: Path, dimension: int) -> list[Fault]:
-    """What is wrong with a group, but for its constraints."""
+    """The faults of a group, except those of its constraints."""
     where = _who(group)
     wrong: list[tuple[str, str]] = []
     if not isinstance(group.name, str) or not group.name.strip() or not group.name.isprintable():
@@ -168,17 +168,17 @@ def _who(group: Group) -> str:
 
 @dataclass
 class Expansion:
-    """A group becoming arrays.
+    """Turns the constraints of a group into arrays.
 
     Attributes:
-        group: without faults of its own.
-        first: where its members begin in the team.
-        ids: of the team.
-        find: the place in the team of an id, or None.
+        group: a group without faults; see `faults_of`.
+        first: index of its first member in the team.
+        ids: ids of the team.
+        find: function from an id to its index in the team, or None.
         dimension: d.
-        path: of the group.
-        faults: what is found wrong.
-        layout: its places.
+        path: place of the group in the input, for faults.
+        faults: list to which faults are added.
+        layout: places of the members.
     """
 
     group: Group
@@ -194,7 +194,7 @@ class Expansion:
         self.layout = layout(self.group, self.dimension)
 
     def parts(self) -> list[tuple[Part, Constraint, Path, str]]:
-        """The constraints of all members, and what each is made from, for faults to name."""
+        """For each constraint of the group: the part with one row per owner, the constraint, and its place in the input, for faults."""
         made: list[tuple[Part, Constraint, Path, str]] = []
         named: dict[str, Path] = {}
         for path, entry in self.entries():
@@ -266,7 +266,7 @@ class Expansion:
         )
 
     def members(self, of: Any, path: Path, where: str) -> Ints:
-        """The places of those who have a constraint."""
+        """The indices, in the group, of the members that own a constraint; see `each` for `of`."""
         count = self.group.count
         if of is None:
             return np.arange(count)
@@ -288,7 +288,12 @@ class Expansion:
         return np.unique(np.array(inside, dtype=np.int64))
 
     class Slots(NamedTuple):
-        """Where the positions that a ψ takes come from: the owner, the related one, or an agent of the team; and the relation."""
+        """The positions that ψ takes.
+
+        Attributes:
+            reads: `OWNER`, `OTHER`, or the index of an agent in the team, for each position.
+            relation: how `OTHER` is found; None if ψ does not read it.
+        """
 
         reads: list[Any]
         relation: Any
@@ -323,7 +328,11 @@ class Expansion:
         return self.Slots(reads, relation)
 
     def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
-        """Of those who have a constraint and whom the relation leads somewhere: their places, and (in the team) whom it leads to."""
+        """Resolve a relation for the owners `rows`.
+
+        Returns:
+            the indices, in the group, of the owners for which the relation finds an agent, and the indices, in the team, of these agents.
+        """
         if relation is None:
             return rows, np.zeros(len(rows), dtype=np.int64)
         if isinstance(relation, np.ndarray):
@@ -355,7 +364,7 @@ class Expansion:
         return rows, others + self.first
 
     def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
-        """Along the group, or along the axes of its grid."""
+        """Resolve an offset along the group (one step) or along the axes of its grid (d steps)."""
         count = self.group.count
         if len(steps) == 1:
             other = rows + steps[0]
@@ -376,11 +385,11 @@ class Expansion:
         places = self.layout.places
         found = cKDTree(places, balanced_tree=False, compact_nodes=False).query(places[rows], k + 1, workers=-1)[1]
         itself = found == rows[:, None]
-        itself[~itself.any(axis=1), -1] = True  # where places coincide it may not be among them
+        itself[~itself.any(axis=1), -1] = True  # where places coincide, the owner may be missing among those found
         return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
 
     def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
-        """(M, …) of one parameter, or the schedule that all share; of no use if it has faults."""
+        """(M, …) values of one parameter, or one schedule for all. Placeholder values if a fault was added."""
         value, places = parameter.value, self.layout.places
         if isinstance(parameter, Vector) and isinstance(value, str) and value == ACROSS and key == "center":
             return -places[row]
@@ -395,7 +404,7 @@ class Expansion:
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
 
     def told_apart(self, made: list[tuple[Part, Constraint, Path, str]]) -> list[tuple[Part, Constraint, Path, str]]:
-        """The same with names, numbered where an owner would have the same one twice."""
+        """The same list with names. A name that one owner would have twice gets a number."""
         stems: dict[str, list[int]] = {}
         others = []
         for p, (part, constraint, _, _) in enumerate(made):
@@ -423,7 +432,7 @@ def _fixed(parameter: Any) -> bool:
 
 
 def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """(M, k − 1) the agents read besides the owner, who is among them; (M, 0) if none are asked for."""
+    """(M, k − 1) the agents read besides the owner, which is one of the k; (M, 0) if k = 0."""
     if not agents.shape[1]:
         return agents
     if (agents[:, 0] == owner).all():
@@ -432,7 +441,7 @@ def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:
 
 
 def _ranks(keys: list[np.ndarray]) -> np.ndarray | None:
-    """How many with equal keys stand before each; None if none do."""
+    """(M,) number of earlier rows with equal keys; None if all rows differ."""
     order = np.lexsort(keys[::-1]) if len(keys) > 1 else np.argsort(keys[0], kind="stable")
     new = np.ones(len(order), dtype=bool)
     new[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
@@ -444,12 +453,12 @@ def _ranks(keys: list[np.ndarray]) -> np.ndarray | None:
 
 
 def stems_clash(a: Counted, b: Counted) -> str | None:
-    """An id that two groups would both have, or None."""
+    """An id that belongs to both of two groups, or None if there is none."""
     short, long = sorted((a, b), key=lambda ids: len(ids.stem))
     tail = long.stem[len(short.stem) :]
     if not long.stem.startswith(short.stem) or not (tail == "" or (tail.isascii() and tail.isdigit() and tail[0] != "0")):
         return None
-    for digits in range(1, len(str(len(long))) + 1):  # the smallest number of so many digits gives the smallest id
+    for digits in range(1, len(str(len(long))) + 1):  # 10^(digits - 1), the smallest number with so many digits, is the first to clash
         number = 10 ** (digits - 1)
         if number <= len(long) and short.find(text := f"{long.stem}{number}") is not None:
             return text

@@ -1,10 +1,10 @@
-"""Margins, smooth margins and local objectives (paper, section IV-B to IV-D), in the log domain throughout.
+"""Margins, smooth margins and local objectives (paper, section IV-B to IV-D), computed in the log domain.
 
 ᾱ_i = min_k ψ_ik                      agent margin
 β̄   = min_i ᾱ_i                      margin of the team
 α_i = −(1/ν_α) ln Σ_k e^{−ν_α ψ_ik}   smooth agent margin (eq. 7)
 β   = −(1/ν_β) ln Σ_i e^{−ν_β α_i}    smooth margin (eq. 9)
-f_i = e^{−ν_β α_i}                    local objective (eq. 15), only ever held as ln f_i = −ν_β α_i
+f_i = e^{−ν_β α_i}                    local objective (eq. 15), stored as ln f_i = −ν_β α_i
 p_ik = softmax_k(−ν_α ψ_ik)           weights, so that ∇f_i = −ν_β f_i Σ_k p_ik ∇ψ_ik (eq. 17)
 """
 
@@ -29,11 +29,11 @@ from consat.problem.team import Team
 from consat.settings import Ramp, Smoothing
 
 STEEPEST = 600.0
-"""ln f_i beyond this is held at it where f_i itself is needed: what overflowed would be NaN where it is multiplied by a weight of 0."""
+"""Upper limit of ln f_i where f_i itself is computed. An overflow to infinity would give NaN when multiplied by a weight of 0."""
 
 
 class Nu(NamedTuple):
-    """The smoothing ν_α, ν_β > 0 in force, in units of 1/ψ."""
+    """The current smoothing ν_α, ν_β > 0, in units of 1/ψ."""
 
     alpha: Array | float
     beta: Array | float
@@ -42,13 +42,13 @@ class Nu(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Schedule:
-    """ν_α constant, ν_β(t) = min(start + rate·t, to): the paper's ramp (section IV-F); a constant where start = to.
+    """Smoothing over time: ν_α constant, ν_β(t) = min(start + rate·t, to), the paper's ramp (section IV-F). Constant if start = to.
 
     Attributes:
-        nu_alpha: ν_α.
-        start: ν_β(0).
-        to: the final ν_β.
-        rate: 1/s.
+        nu_alpha: ν_α, in units of 1/ψ.
+        start: ν_β(0), in units of 1/ψ.
+        to: the final ν_β, in units of 1/ψ.
+        rate: increase of ν_β per second.
     """
 
     nu_alpha: Array
@@ -58,36 +58,36 @@ class Schedule:
 
     @classmethod
     def of(cls, smoothing: Smoothing) -> Schedule:
-        """The schedule that a scenario asks for."""
+        """The schedule of the smoothing in the settings."""
         beta = smoothing.nu_beta
         start, to, rate = (beta.start, beta.to, beta.rate) if isinstance(beta, Ramp) else (beta, beta, 0.0)
         return cls(*(jnp.asarray(value, dtype=float) for value in (smoothing.nu_alpha, start, to, rate)))
 
     def at(self, time: Array | float) -> Nu:
-        """ν at a time of a flow, s."""
+        """ν at `time`, s, of a flow."""
         return Nu(self.nu_alpha, jnp.minimum(self.start + self.rate * time, self.to))
 
     @property
     def final(self) -> Nu:
-        """ν when the ramp is over; what discrete protocols use throughout."""
+        """ν after the ramp. Discrete protocols use it from the start."""
         return Nu(self.nu_alpha, self.to)
 
     @property
     def duration(self) -> float:
-        """How long the ramp lasts, s."""
+        """Duration of the ramp, s; 0 if ν_β is constant."""
         return float((self.to - self.start) / self.rate) if self.to > self.start else 0.0
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """A family on the device: where its arguments stand among the rows of a state.
+    """A family of constraints on the device, with the rows of the state that its functions take.
 
     Attributes:
-        rows: (M_f, arity) int32.
+        rows: (M_f, arity) int32 row of the state for each argument of ψ.
         parameters: arrays with leading axis M_f.
-        weight: (M_f,).
-        psi: the shared function, −∞ where it is no finite number; see `consat.problem.constraints.domain`.
+        weight: (M_f,) positive factors on ψ.
+        psi: the shared function; −∞ where ψ is not a finite number, see `consat.problem.constraints.domain`.
     """
 
     rows: Array
@@ -97,20 +97,20 @@ class Batch:
 
     @property
     def partial(self) -> bool:
-        """Whether ψ may be −∞ somewhere."""
+        """Whether ψ may be −∞ at some positions."""
         return isinstance(self.psi, Extended)
 
     def values(self, x: Array) -> Array:
-        """(M_f,) weighted ψ at a state (rows, d); −∞ where ψ is no finite number."""
+        """(M_f,) weighted ψ at a state of shape (rows, d); −∞ where ψ is not a finite number."""
         return self.weight * self._of_all(lambda at, p: self.psi(*at, **p), x)
 
     def gradients(self, x: Array) -> tuple[Array, Array]:
-        """(M_f,) values and (arity, d, M_f) gradients with respect to the arguments, which are 0 where ψ has none."""
+        """(M_f,) values and (arity, d, M_f) gradients with respect to the arguments; 0 where ψ has no gradient."""
         values, gradients = self._of_all(jax.value_and_grad(lambda at, p: self.psi(*at, **p)), x)
         return self.weight * values, self.weight[None, None] * gradients
 
     def _of_all(self, function: Callable[..., Any], x: Array) -> Any:
-        """A function of the (arity, d) arguments and the parameters of one constraint, for all, which come last."""
+        """Apply a function of the (arity, d) arguments and the parameters of one constraint to all M_f; their axis is the last."""
         parameters = {key: jnp.moveaxis(value, 0, -1) for key, value in self.parameters.items()}
         return jax.vmap(function, in_axes=-1, out_axes=-1)(jnp.moveaxis(pick(x, self.rows), 0, -1), parameters)
 
@@ -118,13 +118,15 @@ class Batch:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Objective:
-    """The local objectives of some agents over the rows of a state: all agents over all copies, or one agent over its own.
+    """The local objectives of a set of agents, as functions of a state of shape (rows, d).
+
+    The set is the whole team, with all estimates as rows, or one agent with its own estimates.
 
     Attributes:
-        batches: the families.
-        order: (M,) where each constraint, in the team's order, stands among the batches; None if they are in order already.
-        owners: groups the constraints, batch after batch, by agent.
-        arguments: groups the arguments of all constraints, batch after batch, by row.
+        batches: one batch per family.
+        order: (M,) index of each constraint, in the team's order, in the concatenated batches; None if the two orders are equal.
+        owners: groups the constraints, in the order of the concatenated batches, by agent.
+        arguments: groups the arguments of all constraints, in the order of the concatenated batches, by row.
     """
 
     batches: tuple[Batch, ...]
@@ -138,8 +140,8 @@ class Objective:
 
         Args:
             team: the team.
-            rows: the rows, (M_f, arity), at which the constraints of a family find their arguments.
-            count: how many rows there are.
+            rows: function from a family to the (M_f, arity) rows of the state that its constraints take.
+            count: number of rows of the state.
         """
         placed = [(family, rows(family)) for family in team.families]
         numbers = np.concatenate([np.zeros(0, dtype=np.int32), *(family.number for family in team.families)])
@@ -163,11 +165,15 @@ class Objective:
 
     @classmethod
     def at_positions(cls, team: Team) -> Objective:
-        """The objectives evaluated at one shared (N, d) array of positions, as an observer of the whole team sees them."""
+        """The objectives at one shared (N, d) array of positions, for an observer of the whole team."""
         return cls.of(team, lambda family: family.agents, team.count)
 
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Objective:
-        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        """The same objectives with new parameter values.
+
+        Args:
+            values: for each family, the parameters to replace, (M_f, …).
+        """
         batches = tuple(replace(batch, parameters={**batch.parameters, **own}) for batch, own in zip(self.batches, values, strict=True))
         return replace(self, batches=batches)
 
@@ -175,11 +181,11 @@ class Objective:
         return by_batch if self.order is None else by_batch[self.order]
 
     def _values(self, x: Array) -> Array:
-        """(M,) every weighted ψ_ik, batch after batch."""
+        """(M,) all weighted ψ_ik, in the order of the concatenated batches."""
         return jnp.concatenate([jnp.zeros(0), *(batch.values(x) for batch in self.batches)])
 
     def psi(self, x: Array) -> Array:
-        """(M,) every weighted ψ_ik, in the team's order."""
+        """(M,) all weighted ψ_ik, in the team's order."""
         return self._in_order(self._values(x))
 
     def agent_margins(self, x: Array) -> Array:
@@ -195,12 +201,12 @@ class Objective:
         return -jax.nn.logsumexp(self.log_objective(x, nu)) / nu.beta
 
     def multipliers(self, x: Array, nu: Nu) -> Array:
-        """(M,) λ_ik = softmax over all agents and constraints, λ ∝ e^{−ν_β α_i} p_ik: how much each constraint binds."""
+        """(M,) multipliers λ_ik ∝ e^{−ν_β α_i} p_ik, which sum to 1 over all agents and constraints. Large where a constraint binds."""
         log_h, weights = self.owners.logsumexp(-nu.alpha * self._values(x))
         return self._in_order(self.owners.spread(softmax(nu.beta / nu.alpha * log_h)) * weights)
 
     def ascent(self, x: Array, nu: Nu) -> Array:
-        """(rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the way each agent would go for its own constraints alone."""
+        """(rows, d) ∇α_i = Σ_k p_ik ∇ψ_ik: the ascent direction of each agent for its own constraints alone, summed by row."""
         return self._added_up(x, nu, lambda log_h, weights: weights)
 
     def gradient(self, x: Array, nu: Nu) -> Array:
@@ -212,8 +218,15 @@ class Objective:
         return self._added_up(x, nu, force)
 
     def _added_up(self, x: Array, nu: Nu, weigh: Callable[[Array, Array], Array]) -> Array:
-        """(rows, d) the sum of all ∇ψ_ik, weighed by a function of ln Σ_k e^{−ν_α ψ_ik}, (N,), and p_ik, (M,). A ψ that is −∞ has no
-        gradient to use: the others of its agent go on without it."""
+        """(rows, d) the weighted sum of all ∇ψ_ik.
+
+        A constraint with ψ = −∞ has no usable gradient. It is left out, and the softmax runs over the other constraints of its agent.
+
+        Args:
+            x: state, (rows, d).
+            nu: smoothing.
+            weigh: function from ln Σ_k e^{−ν_α ψ_ik}, (N,), and p_ik, (M,), to the (M,) weights.
+        """
         values, gradients = zip(*(batch.gradients(x) for batch in self.batches), strict=True) if self.batches else ((), ())
         usable = [
             value if not batch.partial else jnp.where(value >= -HUGE, value, jnp.inf)
@@ -228,18 +241,24 @@ class Objective:
 
 @jax.jit
 def evaluate(observer: Objective, x: Array) -> Array:
-    """(M,) every ψ_ik at one formation, compiled as one program."""
+    """(M,) all weighted ψ_ik at positions `x`, (N, d). Compiled as one program."""
     return observer.psi(x)
 
 
 @jax.jit
 def weigh(observer: Objective, x: Array, nu: Nu) -> tuple[Array, Array]:
-    """(M,) every ψ_ik and (M,) λ_ik at one formation, compiled as one program."""
+    """(M,) all weighted ψ_ik and (M,) λ_ik at positions `x`, (N, d). Compiled as one program."""
     return observer.psi(x), observer.multipliers(x, nu)
 
 
 def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, float]:
-    """The paper's interval β ≤ β̄ ≤ β + ln(N)/ν_β + ln(m̄)/ν_α (eq. 11), at one formation; over agents that have constraints."""
+    """Bounds on the team's margin: β ≤ β̄ ≤ β + ln(N)/ν_β + ln(m̄)/ν_α (paper, eq. 11). N counts only agents that have constraints.
+
+    Args:
+        team: the team.
+        smooth_margin: β at some positions.
+        nu: the smoothing of β.
+    """
     sizes = team.constraints_per_agent
     owners, most = max(int(np.count_nonzero(sizes)), 1), max([1, *sizes[sizes > 0].tolist()])
     slack = math.log(owners) / float(nu.beta) + math.log(most) / float(nu.alpha)
@@ -248,16 +267,16 @@ def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, floa
 
 @float64
 def margins(team: Team, positions: ArrayLike | Mapping[str, ArrayLike]) -> np.ndarray:
-    """(N,) the margin ᾱ_i = min_k ψ_ik of every agent of a team at given positions: positive where all of its constraints hold.
+    """(N,) the margin ᾱ_i = min_k ψ_ik of each agent at given positions. It is positive if all constraints of the agent hold.
 
-    +∞ for an agent without constraints; −∞ where one of its ψ is no finite number, as log(x) is none at x = −1.
+    +∞ for an agent without constraints. −∞ if one of its ψ is not a finite number, such as log(x) at x = −1.
 
     Args:
         team: the team.
-        positions: (N, d), in the order of ``team.ids``, or one position for each id; length.
+        positions: (N, d) in the order of ``team.ids``, or a mapping from id to position; length.
 
     Raises:
-        InvalidSettings: the positions are not those of this team.
+        InvalidSettings: the positions do not fit the team.
     """
     x = _formation(team, positions)
     return np.array(_agent_margins(Objective.at_positions(team), on_device(x)))

@@ -1,4 +1,4 @@
-"""What the parameters of a constraint may be: numbers and vectors, one for a constraint, or arrays of them for a group's."""
+"""Validation of constraint parameters: numbers, vectors and schedules of them; for groups also arrays with one value per constraint."""
 
 from __future__ import annotations
 
@@ -14,15 +14,27 @@ from consat.problem.constraints.record import Fixed, Number, Parameter, Vector
 from consat.problem.schedule import KEYS, MOST_TIMES, Schedule
 
 LARGEST = 1e100
-"""Numbers beyond this are refused: their squares must stay finite in float64."""
+"""Largest size of a number in the input. The square must stay finite in float64."""
 
 Path = tuple[str | int, ...]
 Moving: TypeAlias = "np.ndarray | Schedule"
-"""What a parameter may be: an array, or arrays at times."""
+"""A checked parameter: a constant array, or a schedule if it moves with time."""
 
 
 def checked(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Moving | None:
-    """The value of one parameter as an array, or its schedule with arrays; None, and a fault, if it may not be so."""
+    """Check one parameter.
+
+    Args:
+        parameter: the value and what it must satisfy.
+        dimension: d, the length of a vector.
+        path: place of the parameter in the input, for faults.
+        key: name of the parameter.
+        where: the agent and constraint in words, for faults.
+        faults: list to which faults are added.
+
+    Returns:
+        the value as an array, or a schedule of arrays; None if it is not valid.
+    """
     moves = isinstance(parameter.value, Schedule | Mapping)
     value = (scheduled if moves else still)(parameter, dimension, path, key, where, faults)
     if value is not None and isinstance(parameter, Vector) and parameter.above is not None:
@@ -43,7 +55,7 @@ def _require_above(value: Moving, low: Moving | None, path: Path, key: str, wher
 
 
 def scheduled(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Schedule | None:
-    """A schedule, of whose values each is as the parameter may be."""
+    """A schedule of arrays, each value checked as a constant one is; None, and a fault, if it is not valid. Arguments as in `checked`."""
     times, values = _schedule(parameter.value, path, key, where, faults)
     if times is None or values is None:
         return None
@@ -67,7 +79,7 @@ def scheduled(parameter: Parameter, dimension: int, path: Path, key: str, where:
 
 
 def _schedule(value: Any, path: Path, key: str, where: str, faults: list[Fault]) -> tuple[list[float] | None, list[Any] | None]:
-    """The times and the values of a schedule, if these are lists of one length, and times are numbers that rise."""
+    """The times and values of a schedule: lists of equal length, with increasing finite times. (None, None), and a fault, otherwise."""
     example = f"{key}: {{times: [0, 10], values: [.., ..]}}"
 
     def wrong(message: str, *at: str | int) -> tuple[None, None]:
@@ -97,7 +109,7 @@ def _schedule(value: Any, path: Path, key: str, where: str, faults: list[Fault])
 
 
 def _through_zero(values: np.ndarray) -> int | None:
-    """The first of (K, d) vectors from which a straight line leads through zero to the next; None if none does."""
+    """Index of the first of (K, d) vectors whose straight segment to the next one passes through zero; None if there is none."""
     here, there = values[:-1], values[1:]
     along = there - here
     part = np.clip(-np.sum(here * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-300), 0.0, 1.0)
@@ -108,7 +120,7 @@ def _through_zero(values: np.ndarray) -> int | None:
 
 
 def still(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    """The value of a parameter that does not move."""
+    """The value of a constant parameter as an array; None, and a fault, if it is not valid. Arguments as in `checked`."""
     if isinstance(parameter, Fixed):
         try:
             return np.asarray(parameter.value, dtype=float)
@@ -124,7 +136,19 @@ def still(parameter: Parameter, dimension: int, path: Path, key: str, where: str
 
 
 def checked_rows(parameter: Parameter, size: tuple[int, int], path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    """As `checked`, for an array with one value for each of so many constraints; `size` is their number, and the dimension."""
+    """Check an array with one value per constraint.
+
+    Args:
+        parameter: the array and what each value must satisfy.
+        size: (M, d), the number of constraints and the dimension.
+        path: as in `checked`.
+        key: as in `checked`.
+        where: as in `checked`.
+        faults: as in `checked`.
+
+    Returns:
+        (M,) numbers or (M, d) vectors as floats; None, and a fault, if they are not valid.
+    """
     shape = size if isinstance(parameter, Vector) else size[:1]
     value = np.asarray(parameter.value)
     message = None
@@ -147,12 +171,12 @@ def checked_rows(parameter: Parameter, size: tuple[int, int], path: Path, key: s
 
 
 def is_number(value: Any) -> bool:
-    """Whether `value` is a number, which truth values are not."""
+    """Whether `value` is a real number. Booleans are not."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def number(parameter: Number, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    """The value of a real parameter."""
+    """The value of a scalar parameter as an array of shape (); None, and a fault, if it is not valid."""
     value = parameter.value
     want = "a positive number" if parameter.positive else "a number"
     if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
@@ -167,7 +191,7 @@ def number(parameter: Number, path: Path, key: str, where: str, faults: list[Fau
 
 
 def vector(value: Any, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
-    """A vector with `dimension` entries; with any number of them if that is 0, unknown."""
+    """A vector as a (dimension,) array; None, and a fault, if it is not valid. `dimension` 0 means unknown: any length is accepted."""
     entries = value.tolist() if isinstance(value, np.ndarray | jax.Array) else value
     numbers = f"{dimension} number" + ("s" if dimension > 1 else "")
     if not isinstance(entries, list | tuple):

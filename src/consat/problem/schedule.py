@@ -1,4 +1,4 @@
-"""Parameters that move with time: linear between given times, held before the first and after the last."""
+"""Parameters that move with time: linear between the given times, constant before the first and after the last."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from numpy.typing import ArrayLike
 KEYS: Final = ("times", "values")
 MOST_TIMES: Final = 100_000
 FOREVER: Final = 2.0**40
-"""s; a power of two, so that the time itself, as a schedule, is exact."""
+"""End of `CLOCK`, s. A power of two, so that linear interpolation of the clock is exact."""
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """A number or a vector that moves; see `schedule`.
+    """A number or vector that moves with time; see `schedule`.
 
     Attributes:
-        times: K, s.
-        values: K, as the parameter is.
+        times: (K,) increasing, s.
+        values: (K,) numbers or (K, d) vectors, in the unit of the parameter.
     """
 
     times: Any
     values: Any
 
     def at(self, time: float) -> np.ndarray:
-        """The value at a time, s; of a checked one, whose times and values are arrays."""
+        """The value at `time`, s. The schedule must be checked: its times and values must be arrays."""
         return np.asarray(Track.of({0: self}).at(time)[0])
 
     def plain(self) -> dict[str, Any]:
-        """As a scenario file has it."""
+        """The schedule as plain lists, as a scenario file writes it."""
         return {"times": np.asarray(self.times).tolist(), "values": np.asarray(self.values).tolist()}
 
 
 def schedule(times: ArrayLike, values: ArrayLike) -> Schedule:
-    """A parameter of a constraint that moves: linear between `times`, held before the first and after the last.
+    """A constraint parameter that moves: linear between `times`, constant before the first and after the last.
 
-    ``cs.within(cs.schedule([0, 10], [[0, 0], [5, 0]]), 1)`` is a disc that moves by 5 in ten seconds. `consat.Team` checks it.
+    ``cs.within(cs.schedule([0, 10], [[0, 0], [5, 0]]), 1)`` is a disc that moves by 5 in ten seconds. `consat.Team` checks the schedule.
 
     Args:
-        times: (K,) rising, s.
-        values: (K,) numbers or (K, d) vectors, whichever the parameter is.
+        times: (K,) increasing, s.
+        values: (K,) numbers or (K, d) vectors, as the parameter requires.
     """
     return Schedule(times, values)
 
 
 CLOCK: Final = Schedule([0.0, FOREVER], [0.0, FOREVER])
-"""The time itself, s."""
+"""The schedule whose value is the time, s."""
 
 
 class Track(NamedTuple):
-    """How a parameter of some constraints of a family moves.
+    """The schedules of one parameter for R constraints of a family, stacked.
 
     Attributes:
-        rows: (R,) which constraints, rising.
-        times: (R, K) s, rising.
-        values: (R, K, …).
+        rows: (R,) int32 indices of the constraints in the family, increasing.
+        times: (R, K) increasing, s; padded with infinity.
+        values: (R, K, …) values at these times; padded with the last one.
     """
 
     rows: np.ndarray
@@ -67,21 +67,25 @@ class Track(NamedTuple):
 
     @classmethod
     def of(cls, moving: Mapping[int, Schedule]) -> Track:
-        """From the checked schedules of some constraints."""
+        """The track of checked schedules, given by the indices of their constraints in the family."""
         most = max(len(each.times) for each in moving.values())
         padded = [_padded(np.asarray(each.times, dtype=float), np.asarray(each.values, dtype=float), most) for each in moving.values()]
         times, values = (np.stack(column) for column in zip(*padded, strict=True))
         return cls(np.array(list(moving), dtype=np.int32), times, values)
 
     def at(self, time: float) -> np.ndarray:
-        """(R, …) the values at a time, s."""
+        """(R, …) the values at `time`, s."""
         k, part = _place(self.times, time)
         row = np.arange(len(k))
         low, high = self.values[row, k], self.values[row, np.minimum(k + 1, self.times.shape[1] - 1)]
         return np.asarray(low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low))
 
     def joined(self, more: Sequence[tuple[Track, int]]) -> Track:
-        """With those of further constraints, whose rows begin so much later."""
+        """This track joined with others.
+
+        Args:
+            more: pairs of a track and the offset to add to its rows.
+        """
         tracks = [self, *(track for track, _ in more)]
         most = max(track.times.shape[1] for track in tracks)
         padded = [_padded(track.times, track.values, most) for track in tracks]
@@ -89,7 +93,11 @@ class Track(NamedTuple):
         return Track(rows, *(np.concatenate(column) for column in zip(*padded, strict=True)))
 
     def chosen(self, rows: np.ndarray) -> Track | None:
-        """Of some constraints, (M',) ascending, which are numbered anew; None if none of them moves."""
+        """The track of a subset of the constraints, renumbered from 0; None if none of them moves.
+
+        Args:
+            rows: (M',) ascending indices of the constraints to keep.
+        """
         where = np.searchsorted(rows, self.rows)
         inside = (where < len(rows)) & (rows[np.minimum(where, len(rows) - 1)] == self.rows) if len(rows) else np.zeros(0, dtype=bool)
         if not np.any(inside):
@@ -98,11 +106,11 @@ class Track(NamedTuple):
 
     @property
     def knots(self) -> np.ndarray:
-        """The times at which it bends; not those of the clock."""
+        """The distinct times of all schedules, s, except the end of the clock."""
         return np.unique(self.times[self.times < FOREVER])
 
     def schedule(self, row: int) -> Schedule | None:
-        """Of one constraint, as it was given; None if it does not move."""
+        """The schedule of one constraint, without padding; None if it does not move."""
         place = int(np.searchsorted(self.rows, row))
         if place == len(self.rows) or self.rows[place] != row:
             return None
@@ -112,13 +120,13 @@ class Track(NamedTuple):
 
 
 def chosen(tracks: Mapping[str, Track], rows: np.ndarray) -> dict[str, Track]:
-    """The tracks of some constraints, (M',) ascending."""
+    """The tracks of a subset of the constraints, by parameter name; see `Track.chosen`."""
     kept = ((key, track.chosen(rows)) for key, track in tracks.items())
     return {key: track for key, track in kept if track is not None}
 
 
 def _padded(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """(…, K) and (…, K, …) → with `most` times; the last value is held at times without end."""
+    """Pads (…, K) times and (…, K, …) values to `most` entries: times with infinity, values with the last value."""
     axis = times.ndim - 1
     missing = most - times.shape[axis]
     if not missing:
@@ -128,7 +136,7 @@ def _padded(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarra
 
 
 def _place(times: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) the last of the times, (R, K), that is past, and which part of the way to the next has passed."""
+    """(R,) index of the last of the (R, K) times that is ≤ `time`, and (R,) elapsed fraction of the interval to the next one, in [0, 1]."""
     k = np.maximum((times <= time).sum(axis=1) - 1, 0)
     row = np.arange(len(times))
     here, there = times[row, k], times[row, np.minimum(k + 1, times.shape[1] - 1)]

@@ -1,4 +1,4 @@
-"""Agents, constraints and links: what the problem is. All validation of input lives here, and names every fault at once."""
+"""The team: agents, their constraints and the links between them. Validates all input and reports all faults at once."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     import networkx as nx
 
 MOST_NAMED = 100_000
-"""Up to so many constraints have their names made at once; of more, a name is made when asked for."""
+"""With at most this many constraints, all names are built at once; with more, each name is built on access."""
 
 INSTANTS = 12
-"""So many times tell where moving constraints lead, about."""
+"""Approximate number of times at which moving constraints are sampled; see `Team.instants`."""
 LONGEST_UNIT = 16
 
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
@@ -40,8 +40,8 @@ class Agent:
 
     Attributes:
         id: unique in the team.
-        constraints: what `consat.within` and its like return; lists may nest.
-        start: x_i(0), shape (d,); if None, drawn when the team is run.
+        constraints: what `consat.within` and the other factories return; lists may nest.
+        start: initial position x_i(0), shape (d,), length. If None, it is drawn at random when the team runs.
     """
 
     id: str
@@ -50,30 +50,30 @@ class Agent:
 
 
 class Team:
-    """N agents in R^d, their constraints and who can talk to whom.
+    """N agents in R^d, their constraints and their communication links.
 
     Args:
-        agents: the agents, at least one; a `Group` stands for many.
-        links: who talks to whom: pairs of ids, a `networkx.Graph` over ids, an (L, 2) array of places in `ids`, or one of `TOPOLOGIES`
-            (``task`` links agents along the task graph, the default).
-        dimension: d ≥ 1.
-        unit: what lengths are measured in, such as ``m``, for figures and exports; if None, they name none.
+        agents: at least one agent; a `Group` stands for many.
+        links: pairs of agents that communicate: pairs of ids, a `networkx.Graph` over ids, an (L, 2) array of indices into `ids`, or one of
+            `TOPOLOGIES`. The default ``task`` links the owner of each constraint to the agents that the constraint reads.
+        dimension: d, from 1 to 64.
+        unit: unit of lengths in figures and exports, such as ``m``. If None, none is shown.
 
     Raises:
-        InvalidTeam: names every fault, its agent and constraint, and the cure.
+        InvalidTeam: the input has faults. The message names every fault, its agent and constraint, and the cure.
 
     Attributes:
         ids: the N ids, in order.
         families: the constraints, grouped by function.
-        owner: (M,) the owner of each constraint; the constraints are ordered by owner.
-        names: (M,) their names.
-        links: (L, 2) int32, i < j, each link once.
-        starts: (N, d), NaN where an agent has no start of its own.
-        around: (N, d) and (N,): near which place, and how near on every axis, a member of a group begins, and what others first think of
-            it; NaN where nobody says. None if nobody says of anyone.
+        owner: (M,) index of the agent that owns each constraint; constraints are sorted by owner.
+        names: (M,) names of the constraints.
+        links: (L, 2) int32, i < j, each link once, sorted.
+        starts: (N, d) initial positions, length; NaN for an agent without a given start.
+        around: (N, d) places and (N,) largest distances on each axis: the region in which a group with ``scatter`` starts its members and
+            in which others first estimate them. NaN for other agents. None if no group has ``scatter``.
         members: the agents and groups as given; None if the constraints have been changed since.
         dimension: d.
-        unit: of lengths, or None.
+        unit: unit of lengths, or None.
     """
 
     ids: Sequence[str]
@@ -142,7 +142,7 @@ class Team:
         return [part for part, *_ in made if len(part.owner)]
 
     def with_constraints(self, families: Iterable[Family], owner: np.ndarray, names: Sequence[str]) -> Team:
-        """The same agents and links with other constraints, which are known to fit; see the attributes of `Team`."""
+        """The same agents and links with other constraints. They are not checked; arguments as the attributes of `Team`."""
         team = copy.copy(self)
         team.__dict__.pop("constraints_per_agent", None)
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
@@ -150,7 +150,7 @@ class Team:
 
     @property
     def agents(self) -> tuple[Agent, ...]:
-        """Its agents with their constraints, from which the same team can be made again; those of groups one by one."""
+        """All agents with their constraints, members of groups included. An equal team can be built from them."""
         own: list[list[tuple[int, Constraint]]] = [[] for _ in range(self.count)]
         for family in self.families:
             for k in range(family.size):
@@ -176,23 +176,25 @@ class Team:
 
     @property
     def moves(self) -> bool:
-        """Whether any constraint changes with time."""
+        """Whether any constraint has a parameter that moves with time."""
         return any(family.tracks for family in self.families)
 
     def at(self, time: float) -> Team:
-        """The team with its constraints as they are at a time, s, and stay."""
+        """The team with all parameters frozen at `time`, s."""
         return self.with_constraints([family.at(time) for family in self.families], self.owner, self.names) if self.moves else self
 
     @property
     def knots(self) -> np.ndarray:
-        """The times, s, at which schedules of its constraints begin, bend and end, rising; none of the clock's."""
+        """The distinct times of all schedules, s, increasing, and 0. The end of the clock is left out."""
         found = [track.knots for family in self.families for track in family.tracks.values()]
         return np.unique(np.concatenate([np.zeros(0), *found]))
 
     @property
     def instants(self) -> list[Team]:
-        """The team at some times that tell where its constraints lead: where schedules bend, and where some read the time throughout its
-        first minute. One team if nothing moves."""
+        """The team frozen at sample times; a list with the team itself if nothing moves.
+
+        The times are about `INSTANTS` of its `knots` and, if a constraint reads the time, `INSTANTS` times in the first minute.
+        """
         if not self.moves:
             return [self]
         knots = self.knots
@@ -201,14 +203,20 @@ class Team:
         return [self.at(time) for time in np.unique(times[times >= 0]).tolist()]
 
     def with_links(self, links: np.ndarray) -> Team:
-        """The same agents and constraints with other links, (L, 2), sorted."""
+        """The same agents and constraints with other links, (L, 2), i < j, sorted. They are not checked."""
         team = copy.copy(self)
         team.links = links
         return team
 
     def part(self, agents: np.ndarray) -> tuple[Team, np.ndarray]:
-        """The team of some of the agents, given by their places in ascending order, with the constraints and links that only involve them;
-        and the (M',) places that its constraints have in this one."""
+        """A team of a subset of the agents, with the constraints and links that involve only these.
+
+        Args:
+            agents: (N',) ascending indices of the agents to keep.
+
+        Returns:
+            the team, and the (M',) indices that its constraints have in this team.
+        """
         place = np.full(self.count, -1, dtype=np.int32)
         place[agents] = np.arange(len(agents), dtype=np.int32)
         parts, numbers = [], [np.zeros(0, dtype=np.int32)]
@@ -244,12 +252,12 @@ class Team:
 
     @functools.cached_property
     def place(self) -> Mapping[str, int]:
-        """The place of every agent."""
+        """The index of each agent in `ids`, by id."""
         return {agent: i for i, agent in enumerate(self.ids)}
 
     @functools.cached_property
     def slots(self) -> np.ndarray:
-        """(M, 2) in which family each constraint is, and at which place there."""
+        """(M, 2) int32: for each constraint the index of its family, and its index within the family."""
         slots = np.zeros((len(self.owner), 2), dtype=np.int32)
         for f, family in enumerate(self.families):
             slots[family.number, 0], slots[family.number, 1] = f, np.arange(len(family.number))
@@ -257,7 +265,7 @@ class Team:
 
     @functools.cached_property
     def constraints_per_agent(self) -> np.ndarray:
-        """(N,) m_i."""
+        """(N,) number of constraints m_i of each agent."""
         return np.bincount(self.owner, minlength=self.count)
 
     def _repr_html_(self) -> str:
@@ -270,17 +278,17 @@ class Team:
 
 
 class Index:
-    """Which agent has which id.
+    """Mapping from ids to indices of agents, without a dictionary entry for each member of a group.
 
     Args:
         members: agents and groups.
-        dimension: of the team, 0 if that is a fault.
-        faults: found so far; what is wrong with ids and groups is added.
+        dimension: d of the team; 0 if it is not valid.
+        faults: list to which the faults of ids and groups are added.
 
     Attributes:
-        ids: of all.
-        singles: (place among the members, place in the team, agent) of each agent, …
-        groups: … and of each group that has no faults of its own.
+        ids: ids of all agents.
+        singles: for each single agent: its index among the members, its index in the team, the agent.
+        groups: the same for each group without faults; the index in the team is that of its first member.
     """
 
     def __init__(self, members: Sequence[Agent | Group], dimension: int, faults: list[Fault]) -> None:
@@ -327,7 +335,7 @@ class Index:
             self.count += group.count
 
     def get(self, agent: object) -> int | None:
-        """The place in the team of an id, or None."""
+        """The index in the team of the agent with this id, or None."""
         if not isinstance(agent, str):
             return None
         if agent in self.places:
@@ -344,7 +352,7 @@ class Index:
         return place
 
     def known(self) -> Iterator[str]:
-        """Ids to suggest: of a group only the first few."""
+        """Ids to suggest in messages: of each group only the first `SUGGESTIONS`."""
         yield from self.places
         for _, ids in self.ranges:
             yield from ids[:SUGGESTIONS]
@@ -380,7 +388,7 @@ def _entries(index: Index, dimension: int, faults: list[Fault]) -> Iterator[Entr
 
 
 def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, who: str, faults: list[Fault]) -> str:
-    """The user's name, or one derived from the kind and the other agents, numbered where it repeats."""
+    """The name that the user gave, or one derived from the kind and the other agents, with a number if it would repeat."""
     if constraint.name is not None:
         if not isinstance(constraint.name, str) or not constraint.name.strip() or not constraint.name.isprintable():
             faults.append(Fault((*path, "name"), f"name is {constraint.name!r}, but must be a printable text", who))
@@ -409,7 +417,7 @@ def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: 
         else:
             faults.append(Fault((*path, *key), _unknown(agent, index, faults), where))
     if not isinstance(owner, str) or owner not in index:
-        return ()  # a fault of the owner's id
+        return ()  # the owner's id has a fault, which `Index` reports
     if owner not in reads:
         faults.append(Fault((*path, *key), f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", where))
     if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
@@ -419,7 +427,7 @@ def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: 
 
 
 def _pairs(links: Links, index: Index, faults: list[Fault]) -> np.ndarray | None:
-    """Links as pairs of indices, or None for a named topology."""
+    """(L, 2) links as pairs of indices; None for a named topology, or after a fault in the topology or the array."""
     if isinstance(links, str):
         if links not in TOPOLOGIES:
             choices = ", ".join(TOPOLOGIES)
@@ -448,7 +456,13 @@ def _pairs(links: Links, index: Index, faults: list[Fault]) -> np.ndarray | None
 
 
 def topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
-    """The links of one of `TOPOLOGIES`, (L, 2) int32, i < j, each once."""
+    """The links of one of `TOPOLOGIES`: (L, 2) int32, i < j, sorted, each once.
+
+    Args:
+        kind: one of `TOPOLOGIES`.
+        count: N, the number of agents.
+        families: the constraints, which ``task`` needs.
+    """
     return _unique(_topology(kind, count, families), count)
 
 

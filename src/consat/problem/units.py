@@ -1,8 +1,8 @@
-"""The natural size of a team, read off its constraints: what ``smoothing: auto`` and a start box that nobody gave are measured in.
+"""The natural scales of a team, computed from its constraints. They set ``smoothing: auto`` and the default box of start positions.
 
-A constraint ψ = ½xᵀHx + b·x + c has the scale of its value where it is stationary, s = |c − ½ bᵀH⁺b| (r² for a disc of radius r) and
-the length √(2s/‖H‖) (r). One without curvature has the scale of its gradient over the team's length. So a team in millimetres and the
-same team in kilometres get the same ν·ψ, and take the same rounds.
+A quadratic constraint ψ = ½xᵀHx + b·x + c has the scale |ψ| at its stationary point, s = |c − ½ bᵀH⁺b| (r² for a disc of radius r), and
+the length √(2s/‖H‖) (r). An affine constraint has the scale ‖∇ψ‖ times the length of the team. So a team in millimetres and the same
+team in kilometres get the same ν·ψ and take the same number of rounds.
 """
 
 from __future__ import annotations
@@ -24,28 +24,29 @@ from consat.problem.team import Team
 from consat.settings import Smoothing
 
 SHARPNESS = 5.0
-"""ν times the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
+"""Product of ν and the scale of ψ, as in the paper (ν = 5, discs of radius 1)."""
 MARGIN = 4.0
-"""How far around the constraints' own centres starts are drawn, in lengths (the paper: ±4 for discs of radius 1)."""
+"""Half width of the start box around the centres of the constraints, in natural lengths (paper: ±4 for discs of radius 1)."""
 STRAIGHT = 1e-6
-"""Of a ψ that is not quadratic, a curvature below this part of its largest is none."""
+"""Relative cutoff for the eigenvalues of the Hessian of a ψ that is not quadratic. Smaller ones count as 0."""
 FLATTER = 0.5
-"""A step that is said to lead to where ψ is stationary must leave at most this part of its slope."""
+"""A Newton step is taken to reach a stationary point of ψ if the gradient norm falls at least to this fraction."""
 RIM, ROOM = 0.1, 1.0
-"""How much farther out than the team's places, at most, estimates from far away begin: of a convex team, and of one that is not, where
-agents need room to find a way around one another."""
+"""Widest distance outside the region, relative to its reach, at which distant initial estimates are placed; see `Region.nearby`. `RIM` is
+for convex teams. `ROOM` is for others, where agents need space to move around one another."""
 
 
 class Scale(NamedTuple):
-    """The natural size of a team.
+    """The natural scales of a team.
 
     Attributes:
-        psi: the smallest scale of a ψ, in its units.
-        length: of the positions.
-        center: (d,) mean of the points that constraints on one agent alone point to.
-        spread: largest distance of such a point from the centre on any axis.
-        typical: the median of the scales of all ψ.
-        extent: how far, beyond that, constraints ask agents to be: from the centre, and one after the other from teammates.
+        psi: smallest scale of any ψ, in units of ψ.
+        length: natural length of the positions; 1 if no constraint is curved.
+        center: (d,) mean of the stationary points of the constraints that read one agent only, length.
+        spread: largest distance of such a point from the centre on any axis, length.
+        typical: median of the scales of all ψ, in units of ψ.
+        extent: bound on how far the constraints may force agents apart, length: the sum of the distances that constraints between agents
+            ask for, plus the largest distance from the centre that a constraint on one agent requires.
     """
 
     psi: float
@@ -57,16 +58,16 @@ class Scale(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """How far around the centre, on each axis, the team's places are thought to be."""
+        """Half width, on each axis, of the box around the centre in which the team is expected to end, length."""
         return MARGIN * self.length + self.spread
 
 
 class Region(NamedTuple):
-    """Where a team's places are, as every agent knows it.
+    """The box in which a team is expected to end. Every agent knows it.
 
     Attributes:
-        center: (d,) the team's middle, length.
-        reach: how far around it the places are on each axis, length.
+        center: (d,) centre of the box, length.
+        reach: half width on each axis, length.
     """
 
     center: jax.Array
@@ -77,8 +78,15 @@ class Region(NamedTuple):
         return cls(on_device(size.center), on_device(size.reach))
 
     def nearby(self, x: jax.Array, convex: bool) -> jax.Array:
-        """(n, d) positions: unchanged inside, and from far away brought to its rim, a little farther out the farther they were, keeping
-        their directions, so that no two fall together."""
+        """Move distant positions to the rim of the box.
+
+        Positions inside stay. Others keep their direction from the centre and land between the rim and 1 + `RIM` (or `ROOM`) times the
+        reach. The order of distances is kept, so distinct positions stay distinct.
+
+        Args:
+            x: (n, d) positions, length.
+            convex: whether the team is convex; selects `RIM` or `ROOM`.
+        """
         away = (x - self.center[None, :]) / self.reach
         far = jnp.maximum(jnp.max(jnp.abs(away), axis=1, keepdims=True), 1.0)
         return self.center[None, :] + self.reach * away * ((1.0 + (RIM if convex else ROOM) * (1.0 - 1.0 / far)) / far)
@@ -87,7 +95,10 @@ class Region(NamedTuple):
 @functools.lru_cache(maxsize=16)
 @float64
 def scale(team: Team) -> Scale:
-    """Measure a team; 1 where nothing says otherwise. A team is measured once; one that moves at several times together."""
+    """The natural scales of a team; 1 where no constraint gives one. A moving team is measured over all its `instants` together.
+
+    Cached by team.
+    """
     measured = [_measure(family, team.dimension) for each in team.instants for family in each.families]
     psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
     bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
@@ -106,13 +117,13 @@ def scale(team: Team) -> Scale:
 
 
 def automatic(size: Scale) -> Smoothing:
-    """``smoothing: auto``: ν = `SHARPNESS` over the scale of ψ."""
+    """``smoothing: auto``: ν_α = ν_β = `SHARPNESS` divided by the smallest scale of ψ."""
     nu = SHARPNESS / size.psi
     return Smoothing(nu_alpha=nu, nu_beta=nu)
 
 
 def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
-    """(d,) low and (d,) high of where starts are drawn when nobody says."""
+    """(d,) lower and (d,) upper corner of the default box in which start positions are drawn, length."""
     return size.center - size.reach, size.center + size.reach
 
 
@@ -120,7 +131,7 @@ def start_box(size: Scale) -> tuple[np.ndarray, np.ndarray]:
 def _second_order(
     psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, jax.Array], at: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """(M,) values, (M, n) gradients and (M, n, n) Hessians at (M, n) places, n = arity·d."""
+    """(M,) values, (M, n) gradients and (M, n, n) Hessians at (M, n) points, n = arity·d."""
 
     def flat(x: jax.Array, parameters: dict[str, jax.Array]) -> jax.Array:
         return psi(*x.reshape(arity, dimension), **parameters)
@@ -132,8 +143,12 @@ def _second_order(
 
 
 def _measure(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
-    """Scale, ‖H‖ and slope of each member, the stationary points of those that read one agent alone, and of others how far apart these are
-    where ψ is stationary."""
+    """The scales of a family.
+
+    Returns:
+        (M,) |ψ| at the stationary point, (M,) ‖H‖, (M,) ‖∇ψ‖ at the origin, (K, d) stationary points of constraints that read one agent,
+        and (M,) distances between the agents at the stationary point.
+    """
     try:
         value, b, hessian = expand(family.psi, family.arity, dimension, family.parameters, family.size)
     except ValueError:
@@ -151,14 +166,16 @@ def _measure(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
 
 
 def _between(stationary: np.ndarray, arity: int) -> np.ndarray:
-    """(M,) the largest distance between the positions of (M, arity·d) places; 0 of one position."""
+    """(M,) largest distance from the first position to another one, in (M, arity·d) points; 0 if arity is 1."""
     x = stationary.reshape(len(stationary), arity, -1)
     return np.asarray(np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0))
 
 
 def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
-    """The same beyond degree 2: by one step of Newton from the origin, which says something where it leads to where ψ is flatter.
-    Elsewhere ψ is as good as straight, and has its slope at the origin."""
+    """As `_measure`, for ψ that is not a quadratic: one Newton step from the origin.
+
+    The step counts if the gradient norm falls to `FLATTER` of its value. Otherwise ψ is treated as affine, with its gradient at the origin.
+    """
 
     def look(at: np.ndarray) -> tuple[np.ndarray, ...]:
         value, slope, hessian = (

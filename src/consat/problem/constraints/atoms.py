@@ -1,4 +1,4 @@
-"""Functions of one real number: where they are convex, where they rise, and between which values they stay."""
+"""Scalar functions of one real number: their convexity, monotonicity and range on an interval."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ Array = NDArray[Any]
 
 
 class Facts(NamedTuple):
-    """A function h of one real number, on an interval.
+    """Proven properties of a function h on an interval. Each field has the shape of the interval's bounds.
 
     Attributes:
-        convex: bool.
-        concave: bool.
-        rising: bool; if h is defined on part of the line only, then also once extended by +∞ if convex and −∞ if concave.
-        falling: bool; likewise.
-        low: least value.
-        high: largest value.
+        convex: whether h is convex.
+        concave: whether h is concave.
+        rising: whether h is nondecreasing. If h is defined on part of the line only, this holds for its extension by +∞ (convex h) or −∞
+            (concave h).
+        falling: whether h is nonincreasing; likewise.
+        low: smallest value of h, or a lower bound.
+        high: largest value of h, or an upper bound.
     """
 
     convex: Any
@@ -32,10 +33,17 @@ class Facts(NamedTuple):
 
 
 Atom = Callable[[Array, Array], Facts]
+"""From the bounds (low, high) of the argument to the properties of h on that interval."""
 
 
 def _rising(h: Callable[[Array], Array], convex: str, domain: float = -np.inf) -> Atom:
-    """A rising function that is convex: always, never, from 0 up, or up to 0; elsewhere it is concave."""
+    """The atom of an increasing function.
+
+    Args:
+        h: the function.
+        convex: where h is convex: ``always``, ``never``, ``from 0`` upwards, or up ``to 0``. Elsewhere it is concave.
+        domain: smallest argument at which h is defined.
+    """
 
     def facts(low: Array, high: Array) -> Facts:
         holds = {"always": (True, False), "never": (False, True), "from 0": (low >= 0, high <= 0), "to 0": (high <= 0, low >= 0)}
@@ -45,7 +53,7 @@ def _rising(h: Callable[[Array], Array], convex: str, domain: float = -np.inf) -
 
 
 def _even(h: Callable[[Array], Array]) -> Atom:
-    """A convex function of the absolute value."""
+    """The atom of an even, convex function h, such as cosh."""
 
     def facts(low: Array, high: Array) -> Facts:
         ends = h(low), h(high)
@@ -81,7 +89,7 @@ ATOMS: Final[Mapping[str, Atom]] = {
 
 
 def powers(p: Array) -> Atom:
-    """x^p; with p no integer it is defined for x ≥ 0 only."""
+    """The atom of x^p. If p is not an integer, it is defined for x ≥ 0 only."""
 
     def facts(low: Array, high: Array) -> Facts:
         even, odd = p % 2 == 0, p % 2 == 1
@@ -91,7 +99,7 @@ def powers(p: Array) -> Atom:
         concave = np.where(p >= 0, np.where(whole, (odd & negative) | (p == 0), p < 1), odd & negative)
         rising = np.where(p >= 0, np.where(whole, odd | positive, (p < 1) | positive), even & negative)
         falling = np.where(p >= 0, even & negative, np.where(even, positive, np.where(odd, positive | negative, True)))
-        start, end = (np.where(whole, side, np.maximum(side, 0)) + 0.0 for side in (low, high))  # + 0.0 makes 0 of −0
+        start, end = (np.where(whole, side, np.maximum(side, 0)) + 0.0 for side in (low, high))  # + 0.0 turns −0 into 0
         ends = start**p, end**p
         spans_zero, least, most = (start < 0) & (end > 0), np.minimum(*ends), np.maximum(*ends)
         least = np.where(even & (p > 0) & spans_zero, 0, np.where((p < 0) & ~(start >= 0), np.where(even, 0, -np.inf), least))

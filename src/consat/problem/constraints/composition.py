@@ -1,8 +1,8 @@
-"""The calculus of curvature: what sums, products and functions of functions are, given what their parts are.
+"""The calculus of curvature: `Node`s of sums, products and compositions, computed from the nodes of their operands.
 
 The rules are those of disciplined convex programming (Grant, Boyd, Ye 2006, "Disciplined convex programming", section 6; Boyd,
-Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5), with two additions: polynomials of degree ≤ 2 are carried along exactly,
-coefficients and all, and sums of exponentials are known to be log-convex.
+Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5), with two additions: polynomials of degree ≤ 2 keep their exact
+coefficients, and log-convexity is tracked for sums of exponentials.
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ from consat.problem.constraints.node import ROUNDING, Array, Bend, Node, constan
 
 
 def arranged(nodes: Sequence[Node], index: Array) -> Node:
-    """The array whose entries are those numbered by `index` among the entries of all `nodes`, one after another."""
+    """The node of an array made of entries of other nodes.
+
+    Args:
+        nodes: the source nodes; their entries are numbered consecutively.
+        index: for each entry of the new array, the number of its source entry.
+    """
 
     def pool(*parts: Array) -> Array:
         extra = np.broadcast_shapes(*(part.shape[1 + len(node.shape) :] for node, part in zip(nodes, parts, strict=True)))
@@ -52,21 +57,21 @@ def _term(node: Node, terms: tuple[Array, ...], order: int) -> Array:
 
 
 def highest(degrees: Iterable[int | None]) -> int | None:
-    """The largest, or None if one is unknown."""
+    """The largest degree; None if any is unknown."""
     given = list(degrees)
     known = [degree for degree in given if degree is not None]
     return max(known) if len(known) == len(given) else None
 
 
 def _aligned(*nodes: Node) -> list[Node]:
-    """All of one shape: entries along axes of length 1 are repeated, as are scalars."""
+    """The nodes broadcast to a common shape."""
     shape = np.broadcast_shapes(*(node.shape for node in nodes))
     numbers = (np.arange(math.prod(node.shape)).reshape(node.shape) for node in nodes)
     return [node if node.shape == shape else arranged([node], np.broadcast_to(n, shape)) for node, n in zip(nodes, numbers, strict=True)]
 
 
 def plus(a: Node, b: Node) -> Node:
-    """Curvatures add if they agree."""
+    """The node of a + b. The sum is convex (concave) if both terms are."""
     a, b = _aligned(a, b)
     for logarithm, shift in ((a, b), (b, a)):
         exponents = _shifted_exponents(logarithm, shift)
@@ -87,7 +92,10 @@ def _sum(left: tuple[Array, ...], right: tuple[Array, ...]) -> tuple[Array, ...]
 
 
 def _shifted_exponents(logarithm: Node, shift: Node) -> Node | None:
-    """If this is log Σ exp(u − m) and m, then u: their sum is log Σ exp(u) whatever m is. `jax.nn.logsumexp` computes it so."""
+    """u, if the operands are log Σ exp(u − m) and m; else None.
+
+    Their sum is log Σ exp(u) for any m. `jax.nn.logsumexp` computes it in this form.
+    """
     node: Node | None = _stripped(logarithm)
     for name in ("log", "reduce_sum", "exp"):
         node = _stripped(node.made[1][0]) if node is not None and node.made[0] == name else None
@@ -98,25 +106,28 @@ def _shifted_exponents(logarithm: Node, shift: Node) -> Node | None:
 
 
 def _stripped(node: Node) -> Node:
-    """The node before its only entry was reshaped or repeated."""
+    """The scalar node behind any reshaping or repetition of its single entry."""
     while node.made[0] == "arranged" and len(node.made[1]) == 1 and math.prod(node.made[1][0].shape) == 1:
         (node,) = node.made[1]
     return node
 
 
 def minus(a: Node, b: Node) -> Node:
-    """As a sum."""
+    """The node of a − b."""
     a, b = _aligned(a, b)
     return replace(plus(a, negative(b)), made=("sub", (a, b)))
 
 
 def negative(a: Node) -> Node:
-    """Turns convex into concave."""
+    """The node of −a: convex becomes concave and vice versa."""
     return times(a, constant(-np.ones((1,) * (len(a.shape) + 1))))
 
 
 def times(a: Node, b: Node) -> Node:
-    """By a constant, whose sign decides; degrees add; products of log-convex functions are log-convex."""
+    """The node of a · b.
+
+    The sign of a constant factor decides the curvature. Degrees add. A product of log-convex functions is log-convex.
+    """
     if a is b:
         return power(a, np.array(2.0))
     a, b = _aligned(a, b)
@@ -138,7 +149,7 @@ def times(a: Node, b: Node) -> Node:
 
 
 def _product(left: tuple[Array, ...], right: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Of two polynomials whose degrees add up to at most 2: (p·x)(q·x) = ½ xᵀ(pqᵀ + qpᵀ)x."""
+    """Coefficients of the product of two polynomials whose degrees add up to at most 2: (p·x)(q·x) = ½ xᵀ(pqᵀ + qpᵀ)x."""
 
     def one(i: int, p: Array, j: int, q: Array) -> Array:
         if i == j == 1:
@@ -153,7 +164,7 @@ def _product(left: tuple[Array, ...], right: tuple[Array, ...]) -> tuple[Array, 
 
 
 def larger(a: Node, b: Node) -> Node:
-    """The maximum of convex functions is convex."""
+    """The node of max(a, b): convex if both operands are."""
     a, b = _aligned(a, b)
     for one, two in ((a, b), (b, a)):
         if two.value is not None and np.all(one.bounds[0] >= two.value):
@@ -167,12 +178,12 @@ def larger(a: Node, b: Node) -> Node:
 
 
 def smaller(a: Node, b: Node) -> Node:
-    """The minimum of concave functions is concave."""
+    """The node of min(a, b): concave if both operands are."""
     return negative(larger(negative(a), negative(b)))
 
 
 def fold(operator: Callable[[Node, Node], Node], node: Node, axes: Sequence[int] | None = None) -> Node:
-    """An associative operator over the entries along `axes`, all of them by default."""
+    """The node of a reduction: an associative operator over the entries along `axes`; over all entries if None."""
     axes = range(len(node.shape)) if axes is None else axes
     index = np.arange(math.prod(node.shape)).reshape(node.shape)
     columns = np.moveaxis(index, tuple(axes), range(len(axes))).reshape(-1, *(n for axis, n in enumerate(node.shape) if axis not in axes))
@@ -181,7 +192,13 @@ def fold(operator: Callable[[Node, Node], Node], node: Node, axes: Sequence[int]
 
 
 def dot(a: Node, b: Node, dimension_numbers: Any) -> Node:
-    """Products of all pairs of rows, summed."""
+    """The node of a `dot_general` of a and b.
+
+    Args:
+        a: left operand.
+        b: right operand.
+        dimension_numbers: contracted and batch axes, as JAX gives them.
+    """
     ((contract_a, contract_b), (batch_a, batch_b)) = dimension_numbers
 
     def rows(node: Node, contract: Sequence[int], batch: Sequence[int]) -> Array:
@@ -198,7 +215,7 @@ def dot(a: Node, b: Node, dimension_numbers: Any) -> Node:
 
 
 def atom(name: str, a: Node) -> Node:
-    """A function of one number from `ATOMS`."""
+    """The node of h(a), where h is the function `name` of `ATOMS`."""
     low, high = a.bounds
     if name == "abs" and np.all(low >= 0):
         return a
@@ -208,7 +225,7 @@ def atom(name: str, a: Node) -> Node:
     if name == "exp" and node.rule is not None:
         return replace(node, rule=node.rule._replace(logconvex=node.rule.convex))
     if name == "log" and node.rule is not None:
-        # By log-convexity alone nothing is known about strictness.
+        # Log-convexity proves that the logarithm is convex, but not that it is strictly so.
         rule, known = node.rule, a.bend.logconvex
         return replace(node, rule=rule._replace(convex=rule.convex | known, strict=rule.strict & ~known[..., None]))
     if name == "sqrt" and a.degree == 2 and a.terms is not None:
@@ -226,15 +243,18 @@ def _composed(facts: Atom, a: Node) -> Node:
     convex = h.convex & (affine | (h.rising & u.convex) | (h.falling & u.concave))
     concave = h.concave & (affine | (h.rising & u.concave) | (h.falling & u.convex))
     strict = u.strict & ~affine[..., None]
-    if a.degree == 1 and a.terms is not None:  # all of `ATOMS` bend a line
+    if a.degree == 1 and a.terms is not None:  # no function of `ATOMS` is affine on an interval of nonzero length
         varies = np.any(np.abs(a.terms[1]) > ROUNDING * a.sizes[1], axis=(-2, -1))
         strict = np.stack([np.zeros_like(varies)] * (a.terms[1].shape[-2] + 1) + [varies], axis=-1)
     return Node(a.shape, None, h.low, h.high, rule=Bend(convex, concave, np.zeros_like(convex), strict))
 
 
 def _cone(q: Node, bend: Bend) -> Bend:
-    """√q for a quadratic q: convex iff q ≥ 0 everywhere, so that q = ‖affine‖² + constant; if the constant is positive, then strictly so
-    wherever q is. Sums of squares show it by their bounds; for others the constant 0 must be recognised in spite of rounding."""
+    """The curvature of √q for a quadratic q.
+
+    It is convex iff q ≥ 0 everywhere, so that q = ‖affine‖² + constant. If the constant is positive, √q is strictly convex where q is.
+    For a sum of squares the bounds prove q ≥ 0. For other q a tolerance is needed, because rounding may make a constant of 0 negative.
+    """
     cone = (q.low >= 0) | q.nonnegative(0.0, 4e-15)
     smooth = q.nonnegative(1e-6) & (q.sizes[0] > 0)
     kind = np.arange(q.bend.strict.shape[-1]) < q.bend.strict.shape[-1] - 1
@@ -243,7 +263,7 @@ def _cone(q: Node, bend: Bend) -> Bend:
 
 
 def power(a: Node, p: Array) -> Node:
-    """a^p for known p."""
+    """The node of a^p for known exponents p."""
     if np.all(p == 0):
         return constant(np.ones((1,) * (len(a.shape) + 1)))
     if np.all(p == 1):
@@ -260,7 +280,7 @@ def power(a: Node, p: Array) -> Node:
 
 
 def square(a: Node) -> Node:
-    """a², of a function that varies: a quadratic if a is affine or the root of one."""
+    """The node of a² for a function a that is not constant. It is a quadratic if a is affine or the square root of a quadratic."""
     if a.made[0] == "sqrt" and np.all(a.made[1][0].bounds[0] >= 0):
         return a.made[1][0]
     node = _composed(powers(np.array(2.0)), a)
@@ -270,7 +290,7 @@ def square(a: Node) -> Node:
 
 
 def raised(base: Node, exponent: Node) -> Node:
-    """Of nodes, either of them a known constant: k^u = exp(u log k)."""
+    """The node of base^exponent, if one of the two is a known constant: k^u = exp(u log k). Else an unknown node."""
     base, exponent = _aligned(base, exponent)
     if exponent.value is not None:
         return power(base, exponent.value)

@@ -1,19 +1,18 @@
-"""The curvature of a constraint function, read off its trace.
+"""Proof of the curvature of a constraint function from its JAX trace.
 
-ψ is traced to a jaxpr, and every intermediate of that jaxpr is described by a `Node`: what kind of function of the positions it is.
-Three things are tried in turn, and only what is proven is said.
+ψ is traced to a jaxpr. A `Node` describes each intermediate value of the jaxpr as a function of the positions. Three methods are tried in
+turn; only proven results are reported.
 
-1. **Degree.** A polynomial of degree ≤ 2 is carried along exactly, coefficients and all. Its Hessian is a constant matrix, whose
-   eigenvalues decide.
+1. **Degree.** A polynomial of degree ≤ 2 keeps its exact coefficients. Its Hessian is a constant matrix, and the eigenvalues decide.
 2. **Composition.** Otherwise the rules of disciplined convex programming (Grant, Boyd, Ye 2006, "Disciplined convex programming",
-   section 6; Boyd, Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5) go from node to node: sign, curvature, monotonicity.
-   √q with q quadratic is convex iff q is ‖affine‖², i.e. iff [[A, b], [bᵀ, 2c]] is positive semidefinite; logarithms of sums of
-   exponentials are known, shifted by their maximum (`jax.nn.logsumexp`) or not.
-3. **Refutation.** Otherwise a segment is sought on which ψ dips below its chord: that is a proof of not-concave.
+   section 6; Boyd, Vandenberghe 2004, "Convex optimization", sections 3.2 and 3.5) derive sign, curvature and monotonicity from node to
+   node. √q with q quadratic is convex iff q ≥ 0 everywhere, i.e. iff [[H, b], [bᵀ, 2c]] is positive semidefinite. The logarithm of a sum
+   of exponentials is recognised, with or without the shift by the maximum that `jax.nn.logsumexp` applies.
+3. **Refutation.** Otherwise a line segment is searched on which ψ lies below its chord. Such a segment proves that ψ is not concave.
 
-As is the convention there, a function counts as concave if it is concave where it is defined: log(x) is, its domain being convex.
+By the convention of disciplined convex programming, a function is concave if it is concave on its domain: log(x) is concave.
 
-Every `Node` describes a whole family at once: the leading axis of its arrays, of length M or 1, runs over the members.
+Each `Node` describes a whole family: the leading axis of its arrays, of length M or 1, runs over the members.
 """
 
 from __future__ import annotations
@@ -42,17 +41,19 @@ Psi = Callable[..., Any]
 
 EPSILON: Final = float(np.finfo(np.float64).eps)
 NUDGE: Final = 1e-7
+"""Relative size of the random perturbations that estimate the rounding error; see `_evaluator`."""
 DOUBT: Final = 1e3
-"""How far a chord must run above ψ, as a multiple of what rounding is estimated to do, to be beyond doubt."""
+"""Required gap between a chord and ψ, as a multiple of the estimated rounding error, to prove that ψ is not concave."""
 BLOCK: Final = 1 << 12
+"""Number of points evaluated by one call of a compiled program."""
 CHUNK: Final = 1 << 22
-"""Members are read in chunks of about this many matrix entries."""
+"""Members are processed in chunks of about this many matrix entries."""
 PROBES: Final = 1 << 14
-"""Points tried per family to refute concavity, but at least 4 and at most 512 per member."""
+"""Number of points per family tried to refute concavity; at least 4 and at most 512 per member."""
 
 
 class Curvature(enum.StrEnum):
-    """What is known of ψ in all its positions jointly."""
+    """The proven curvature of ψ as a function of all its positions jointly."""
 
     STRICTLY_CONCAVE = "strictly-concave"
     CONCAVE = "concave"
@@ -66,12 +67,12 @@ _STRICTLY, _CONCAVE, _UNKNOWN, _NOT = range(4)
 
 @dataclass(frozen=True)
 class Reading:
-    """What is proven of one ψ.
+    """The proven properties of one ψ.
 
     Attributes:
-        curvature: in all positions jointly.
-        strict_in: for each position, whether ψ is strictly concave in that one alone, the others held.
-        degree: at most this as a polynomial in the positions (0, 1 or 2); None if more, if none, or if unknown.
+        curvature: curvature in all positions jointly.
+        strict_in: for each position, whether ψ is strictly concave in that position alone, with the others fixed.
+        degree: upper bound (0, 1 or 2) on the degree of ψ as a polynomial in the positions; None if no such bound is proven.
     """
 
     curvature: Curvature
@@ -81,12 +82,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Readings:
-    """What is proven of a family of M functions; `readings[m]` is one `Reading`.
+    """The proven properties of a family of M functions; `readings[m]` is one `Reading`.
 
     Attributes:
-        curvature: (M,), of `Curvature`.
-        strict_in: (M, arity), bool.
-        degree: of them all.
+        curvature: (M,) of `Curvature`.
+        strict_in: (M, arity) bool; as in `Reading`.
+        degree: as in `Reading`, for all members together.
     """
 
     curvature: Array
@@ -101,7 +102,15 @@ class Readings:
 
 
 class Quadratics(NamedTuple):
-    """ψ_m(x) = c_m + b_m·x + ½ xᵀH_m x, x the arity * d entries of all positions. Read-only: members may share memory."""
+    """Coefficients of ψ_m(x) = c_m + b_m·x + ½ xᵀH_m x, where x holds the n = arity * d entries of all positions.
+
+    Read-only: members may share memory.
+
+    Attributes:
+        constant: c, (M,).
+        gradient: b, (M, n).
+        hessian: H, (M, n, n).
+    """
 
     constant: Array
     gradient: Array
@@ -113,9 +122,9 @@ def read_curvature(psi: Psi, arity: int, dimension: int, parameters: Mapping[str
 
     Args:
         psi: ``psi(*positions, **parameters) -> scalar``, traceable by JAX.
-        arity: number of positions it takes.
-        dimension: d, the length of each.
-        parameters: its keyword arguments.
+        arity: number of positions ψ takes.
+        dimension: d, the length of each position.
+        parameters: keyword arguments of ψ.
     """
     return read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()})[0]
 
@@ -126,11 +135,11 @@ def read_curvatures(
     """The curvature of every member of a family; see `read_curvature`.
 
     Args:
-        psi: as there.
-        arity: as there.
-        dimension: as there.
-        stacked_parameters: the keyword arguments, members along axis 0. What is proven holds whatever value stands where one is NaN.
-        members: M; may be left out if there is a parameter.
+        psi: as in `read_curvature`.
+        arity: as in `read_curvature`.
+        dimension: as in `read_curvature`.
+        stacked_parameters: keyword arguments of ψ, members along axis 0. NaN stands for any value: the result holds for all of them.
+        members: M; required only if ψ has no parameters.
     """
     family = _Family.of(psi, arity, dimension, stacked_parameters, members)
     nodes = family.nodes()
@@ -146,20 +155,20 @@ def read_curvatures(
 
 
 def degree(psi: Psi, arity: int, dimension: int, example_parameters: Mapping[str, ArrayLike]) -> int | None:
-    """A bound (0, 1 or 2) on the polynomial degree of ψ in the positions, whatever the values of its parameters; None if there is none.
+    """An upper bound (0, 1 or 2) on the polynomial degree of ψ in the positions, for all parameter values; None if none is proven.
 
     Args:
         psi: as in `read_curvature`.
-        arity: as there.
-        dimension: as there.
-        example_parameters: keyword arguments of the right shape and type.
+        arity: as in `read_curvature`.
+        dimension: as in `read_curvature`.
+        example_parameters: keyword arguments with the right shapes and types; their values do not matter.
     """
     family = _Family.of(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in example_parameters.items()})
     return family.read({key: opaque(value.shape[1:]) for key, value in family.parameters.items()}).degree
 
 
 def expand(psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[str, ArrayLike], members: int | None = None) -> Quadratics:
-    """The coefficients of every member of a family of degree ≤ 2.
+    """The coefficients of each member of a family of degree ≤ 2; arguments as in `read_curvatures`.
 
     Raises:
         ValueError: ψ is not proven to be of degree ≤ 2.
@@ -184,7 +193,7 @@ def hessians(psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[s
 
 @dataclass(frozen=True)
 class _Family:
-    """ψ traced, with the parameters of all its members."""
+    """A traced ψ with the stacked parameters of all members."""
 
     psi: Psi
     arity: int
@@ -208,11 +217,11 @@ class _Family:
 
     @property
     def moving(self) -> bool:
-        """Whether some parameters may take any value."""
+        """Whether some parameter is NaN, which stands for any value (it moves with time)."""
         return any(value.dtype.kind == "f" and bool(np.isnan(value).any()) for value in self.parameters.values())
 
     def nodes(self) -> list[tuple[int, Node]]:
-        """What ψ is, chunk by chunk, with the number of members in the chunk."""
+        """(number of members, node of ψ) for each chunk of members."""
         size = max(1, CHUNK // (self.arity * self.dimension + 1) ** 2)
         return [
             (
@@ -223,7 +232,7 @@ class _Family:
         ]
 
     def read(self, parameters: Mapping[str, Node]) -> Node:
-        """What ψ is, given what its parameters are."""
+        """The node of ψ, given the nodes of its parameters."""
         positions = [position(slot, self.arity, self.dimension) for slot in range(self.arity)]
         arguments = [*positions, *(parameters[key] for key in sorted(parameters))]
         with np.errstate(all="ignore"), jax.enable_x64(True):
@@ -233,7 +242,17 @@ class _Family:
 
 @np.errstate(all="ignore")
 def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array]:
-    """Codes (M,) and `strict_in` (M, arity) of a scalar node; moving: whether terms that are NaN are those of parameters that move."""
+    """The curvature of ψ from its node.
+
+    Args:
+        node: a scalar node.
+        arity: number of positions ψ takes.
+        members: M.
+        moving: whether NaN in the constant and linear terms comes from moving parameters and is therefore allowed.
+
+    Returns:
+        (M,) indices into `_LABELS` and (M, arity) `strict_in`.
+    """
     if node.terms is None:
         bend = node.bend
         strict = np.broadcast_to(bend.strict, (*bend.strict.shape[:-1], arity + 2))
@@ -251,15 +270,15 @@ def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> 
 
 
 def _repeated(array: Array, members: int) -> Array:
-    """One row, or as many as there are members, as so many."""
+    """An array with one row, or one row per member, broadcast to one row per member."""
     return np.broadcast_to(array, (members, *array.shape[1:]))
 
 
 def _refuted(family: _Family, members: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Which of these members have a segment on which ψ dips below its chord, by more than rounding explains.
+    """Which of the members have a segment on which ψ lies below its chord by more than rounding explains.
 
-    Points are drawn about the origin and about the numbers among the parameters, at several scales; segments run through them along
-    the direction in which ψ is most convex at that scale, and along a random one.
+    Points are drawn around the origin and around numbers taken from the parameters, at several scales. Segments run through each point
+    along the direction in which ψ is most convex at that scale, and along a random direction.
     """
     numbers = [value[members].reshape(len(members), -1) for value in family.parameters.values() if value.dtype.kind in "iuf"]
     table = np.concatenate([np.zeros((len(members), 1)), *numbers], axis=1)
@@ -275,7 +294,14 @@ def _refuted(family: _Family, members: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def _probes(rows: Array, count: int, arity: int, d: int) -> tuple[Array, Array]:
-    """Points (members, count, arity * d) and scales (members, count, 1) at which to look, given the numbers of every member."""
+    """Points (members, count, arity * d) and length scales (members, count, 1) to test, drawn from a fixed seed.
+
+    Args:
+        rows: (members, K) numbers among the parameters of each member, and 0.
+        count: number of points per member.
+        arity: number of positions ψ takes.
+        d: length of each position.
+    """
     rng = np.random.default_rng(0)
     start = rng.integers(rows.shape[1], size=(count, arity, 1)) + np.arange(d)
     about = rows[:, start % rows.shape[1]] * (rng.random((count, 1, 1)) < 0.5)
@@ -288,13 +314,19 @@ def _probes(rows: Array, count: int, arity: int, d: int) -> tuple[Array, Array]:
 
 @np.errstate(all="ignore")
 def _dips(values: Callable[[Array], tuple[Array, Array]], points: Array, reach: Array) -> NDArray[np.bool_]:
-    """Whether ψ dips below its chord about each of these points."""
+    """Whether ψ lies below a chord through each point.
+
+    Args:
+        values: function from (…, n) points to ψ and its estimated rounding error.
+        points: (members, count, n).
+        reach: (members, count, 1) length scales.
+    """
     n = points.shape[-1]
     unit = np.eye(n)
     row, column = np.triu_indices(n)
     corners, _ = values(points[..., None, :] + reach[..., None] * np.concatenate([0 * unit[:1], unit, unit[row] + unit[column]]))
     ends = corners[..., 1 : n + 1] - corners[..., :1]
-    hessian = np.zeros((*points.shape, n))  # by differences, so that it sees the kinks within reach; the scale does not matter
+    hessian = np.zeros((*points.shape, n))  # by finite differences, which also see kinks within reach; only its eigenvectors are used
     hessian[..., column, row] = corners[..., n + 1 :] - corners[..., :1] - ends[..., row] - ends[..., column]
     steepest = np.linalg.eigh(np.where(np.isfinite(hessian), hessian, 0))[1][..., -1]
     random = np.random.default_rng(1).normal(size=points.shape) / np.sqrt(n)
@@ -306,10 +338,10 @@ def _dips(values: Callable[[Array], tuple[Array, Array]], points: Array, reach: 
 
 
 def _evaluator(family: _Family) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """From members (m,) and points (m, …, n) to ψ there, and to what rounding may have done to it.
+    """A function from members (m,) and points (m, …, n) to the values of ψ and an estimate of their rounding errors.
 
-    That is estimated as in Monte Carlo arithmetic (Parker 1997): every number computed on the way is nudged at random, relative to its
-    own size, and the outcome compared.
+    The estimate uses Monte Carlo arithmetic (Parker 1997): each intermediate result is perturbed at random, relative to its size, and the
+    results are compared.
     """
     n, rng = family.arity * family.dimension, np.random.default_rng(2)
     shapes = [(n,), *(aval.shape for aval in _computed(family.trace) if np.issubdtype(aval.dtype, np.floating))]
@@ -333,7 +365,7 @@ def _evaluator(family: _Family) -> Callable[[Array, Array], tuple[Array, Array]]
     def evaluated(members: Array, points: Array) -> tuple[Array, Array]:
         flat, whose = points.reshape(-1, n), np.repeat(members, points[0, ..., 0].size)
         parts = []
-        for start in range(0, len(flat), BLOCK):  # of one size, so that all is compiled once
+        for start in range(0, len(flat), BLOCK):  # blocks of one size, so that the program is compiled once
             some = np.arange(start, start + BLOCK) % len(flat)
             with jax.enable_x64(True):
                 block = compiled({key: value[whose[some]] for key, value in family.parameters.items()}, flat[some], nudges)
@@ -346,7 +378,7 @@ def _evaluator(family: _Family) -> Callable[[Array, Array], tuple[Array, Array]]
 
 
 def _computed(trace: core.ClosedJaxpr) -> list[Any]:
-    """Shapes and types of all that is computed, in order."""
+    """Shapes and types of all intermediate results of a trace, in order of computation."""
     avals: list[Any] = []
 
     def step(eqn: core.JaxprEqn, _: Sequence[None]) -> Sequence[None] | None:

@@ -1,9 +1,8 @@
-"""ψ that end somewhere: 1/‖p − q‖², log, sqrt(4 − ‖p‖²), e^{…}. A ψ that is not a finite number at a point is −∞ there (design,
-section 10).
+"""Functions ψ that are not finite everywhere, such as 1/‖p − q‖², log and sqrt(4 − ‖p‖²). Where ψ is not a finite number, it counts as −∞.
 
-`Extended` gives a ψ that value, and derivatives that are finite wherever they are asked for: 0 where ψ has none that are. A select after
-the fact would not do: differentiated backwards it multiplies the NaN of the branch not taken by 0. So the derivatives are computed
-apart, checked, and handed to JAX as those of the function.
+`Extended` returns this value, and derivatives that are always finite: 0 where ψ has no finite derivative. `jnp.where` on the result is not
+enough: reverse-mode differentiation multiplies the NaN of the unused branch by 0, which is NaN. Therefore the derivatives are computed
+separately, checked, and given to JAX as custom derivatives.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from consat.problem.constraints.curvature import degree
 Psi = Callable[..., Any]
 
 HUGE: Final = 1e100
-"""A ψ below −HUGE, or a derivative beyond it, is of no use to arithmetic: its square overflows. It counts as a wall, as −∞ does."""
+"""Largest usable size of ψ and its derivatives. Beyond it, squares may overflow; such a value is treated like −∞."""
 
 
 @dataclass(frozen=True)
 class Extended:
-    """ψ with −∞ where it is no finite number, and derivatives, up to the second, that are 0 where they are none.
+    """ψ extended by −∞ where it is not a finite number, with first and second derivatives of 0 where they are not finite.
 
-    Equal to another if ψ is, so that a program compiled for one serves the other. Parameters have no derivatives here.
+    Two instances are equal if their ψ is, so compiled programs are shared. There are no derivatives with respect to the parameters.
 
     Attributes:
         psi: ``psi(*positions, **parameters) -> scalar``.
@@ -44,13 +43,13 @@ class Extended:
 
 
 def extended(psi: Psi, arity: int, dimension: int, parameters: Mapping[str, np.ndarray]) -> Psi:
-    """ψ itself if it is a polynomial of degree ≤ 2, which is finite everywhere and pays nothing; else `Extended`.
+    """ψ itself if it is a polynomial of degree ≤ 2, which is finite everywhere; else `Extended`.
 
     Args:
         psi: as in `Extended`.
-        arity: number of positions it takes.
-        dimension: d, the length of each.
-        parameters: its keyword arguments, with the members of a family along their first axis.
+        arity: number of positions ψ takes.
+        dimension: d, the length of each position.
+        parameters: keyword arguments of ψ, with the members of the family along axis 0.
     """
     shapes = tuple((key, np.shape(value)[1:], np.asarray(value).dtype.str) for key, value in sorted(parameters.items()))
     return psi if _is_quadratic(psi, arity, dimension, shapes) else Extended(psi)
@@ -71,7 +70,7 @@ def _where(usable: Array, arrays: Any) -> Any:
 
 
 def _dot(slopes: Any, moves: Any) -> Array:
-    """Σ over all positions."""
+    """The sum over all positions of slope · move."""
     return functools.reduce(jnp.add, [jnp.sum(slope * move) for slope, move in zip(slopes, moves, strict=True)])
 
 

@@ -1,7 +1,7 @@
-"""Constraints ψ as text, e.g. ``2**2 - norm2(a2 - a3)``: a small language of differentiable arithmetic on positions.
+"""Text expressions for ψ, e.g. ``2**2 - norm2(a2 - a3)``: a small language of differentiable arithmetic on positions.
 
 ==============  ===========================================================================================================
-positions       an agent id stands for its position, a vector in R^d; an id that is no name is quoted: ``'robot-1'``
+positions       an agent id stands for its position, a vector in R^d; an id that is not a name is quoted: ``'robot-1'``
 components      ``a1.x``, ``a1.y``, ``a1.z``, or ``a1[0]``, ``a1[1]``, …; of any vector: ``(a1 - a2).x``
 numbers         ``3``, ``0.5``, ``1e-3``, ``pi``
 vectors         ``[1, 0.5 * a1.x]``: d entries, each a number
@@ -11,13 +11,13 @@ of vectors      ``norm2(v)`` = ‖v‖², ``norm(v)`` = ‖v‖ (gradient 0 at 0
 of numbers      ``sqrt exp log sin cos tan asin acos atan sinh cosh tanh square``, ``atan2(y, x)``
 ==============  ===========================================================================================================
 
-The value is a number, positive where the constraint holds, and reads at least one agent. Everything here, but ``norm`` at 0, is
-continuously differentiable inside its domain; hence no ``abs``, ``min``, ``max`` and comparisons. ``t`` is the time in seconds. Functions,
-``pi`` and ``t`` win over agents with the same id, which the quoted form reaches.
+The value is a number, positive where the constraint holds. An expression reads at least one agent. All operations, except ``norm`` at 0,
+are continuously differentiable inside their domain; therefore ``abs``, ``min``, ``max`` and comparisons are missing. ``t`` is the time in
+seconds. The names of functions, ``pi`` and ``t`` take precedence over agents with the same id; quote the id to name the agent.
 
-Nothing is ever executed: Python's parser yields a tree, `_Translator` admits what is listed above and refuses the rest, and `Formula`
-evaluates the outcome with `jax.numpy`. Literals are folded and then taken out of the tree, so that constraints with different
-agents and numbers share one `Formula`, hence one family (see `consat.problem.constraints.record`).
+The text is never executed as Python. Python's parser yields a tree, `_Translator` accepts only what is listed above, and `Formula`
+evaluates the result with `jax.numpy`. Literals are folded and then taken out of the tree, so constraints with different agents and numbers
+share one `Formula` and hence one family (see `consat.problem.constraints.record`).
 """
 
 from __future__ import annotations
@@ -50,13 +50,14 @@ MAX_NUMBER: Final = 1e15
 
 
 class _Operation(NamedTuple):
-    """What an operation takes and does.
+    """Operand types and evaluation of an operation.
 
     Attributes:
-        takes: the kinds of its operands, p for a number and v for a vector, as a regular expression that names first the kind wanted.
-        apply: from the operands' values, and the details of the node, to the value.
-        fold: the same for literal numbers, in plain floats.
-        wrong: what to say of operands of other kinds, if it is not a function.
+        takes: types of the operands as a regular expression: p for a number, v for a vector. Its first letter is the type that an error
+            message asks for.
+        apply: from the values of the operands, and the details of the node, to the value.
+        fold: the same for literal numbers as Python floats; None if literals are not folded.
+        wrong: error message for operands of other types, if the operation is not a function.
     """
 
     takes: str
@@ -105,7 +106,7 @@ _INSTEAD: Final[Mapping[str | type, str]] = {
     ast.Tuple: "a vector is written in square brackets, e.g. [1, 2]",
     ast.BitXor: "a power is written **, not ^",
 }
-"""What to say of functions and syntax that people may expect and the language lacks."""
+"""Error messages for functions and syntax that users may expect but the language does not have."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,10 @@ class _Node:
 
     Attributes:
         operation: ``number``, ``agent``, ``time``, or a key of `_OPERATIONS`.
-        operands: what it works on.
-        details: of ``**`` the exponent, of a component its axis, of an agent its slot; of a number its value or, once lifted, its index.
-        column: where it stands in the text; not part of the structure.
+        operands: nodes of the operands.
+        details: the exponent of ``**``, the axis of a component, the index of an agent in `Expression.reads`, or the value of a number.
+            After `_lift`, a number has its index in `Expression.numbers` instead.
+        column: column in the text, from 0; ignored by comparisons.
     """
 
     operation: str
@@ -127,7 +129,10 @@ class _Node:
 
 @dataclass(frozen=True)
 class Formula:
-    """ψ as a function of positions and numbers, equal to another if the structure is; columns of faults refer to the own text."""
+    """ψ as a function of positions and numbers. Two formulas are equal if their trees have the same structure.
+
+    The columns in its errors refer to the text of the expression it was made from.
+    """
 
     tree: _Node
 
@@ -136,11 +141,11 @@ class Formula:
 
         Args:
             positions: one (d,) array for each agent in `Expression.reads`, length.
-            numbers: as many as in `Expression.numbers`, in that order.
-            t: the time, s.
+            numbers: (K,) values of the literals, in the order of `Expression.numbers`.
+            t: time, s.
 
         Raises:
-            InvalidExpression: numbers and vectors are mixed up, or do not fit d.
+            InvalidExpression: a number stands where a vector is required or vice versa, or a vector or component does not fit d.
         """
         value = _evaluate(self.tree, [jnp.asarray(x) for x in positions], jnp.asarray(numbers), jnp.asarray(t))
         if value.ndim:
@@ -152,14 +157,14 @@ class Formula:
 
 @dataclass(frozen=True)
 class Expression:
-    """A text expression, read.
+    """A parsed text expression.
 
     Attributes:
-        text: as written.
-        reads: the agents whose positions it takes, in order of first appearance.
-        numbers: its literals after folding, with their sign, in order of appearance; exponents and axes belong to the structure instead.
-        function: ``function(*positions, numbers=numbers)`` is ψ, JAX-traceable; with ``t=time`` besides, if it moves.
-        moves: whether it reads the time.
+        text: the text as written.
+        reads: ids of the agents whose positions it takes, in order of first appearance.
+        numbers: its literals after folding, in order of appearance. Exponents and axes are not among them: they are part of the structure.
+        function: ψ as ``function(*positions, numbers=numbers)``, JAX-traceable. If `moves`, it also takes ``t=time``, s.
+        moves: whether the expression reads the time.
     """
 
     text: str
@@ -170,10 +175,10 @@ class Expression:
 
     @classmethod
     def parse(cls, text: str) -> Expression:
-        """Read `text`. Whether its vectors and numbers fit together shows when `function` is called or traced.
+        """Parse `text`. The types of vectors and numbers are checked later, when `function` is called or traced.
 
         Raises:
-            InvalidExpression: the text is not in the language; says what is wrong, where, and what would be right.
+            InvalidExpression: the text is not in the language. The message says what is wrong, where, and what would be right.
         """
         if not isinstance(text, str):
             raise InvalidExpression(f"an expression must be text, but this is of type {type(text).__name__}")
@@ -190,7 +195,7 @@ class Expression:
 
 
 def _syntax(line: str) -> ast.expr:
-    """Python's syntax tree of the line without its leading spaces, in which anything may still stand."""
+    """Python's syntax tree of the line without its leading spaces. It may still contain syntax that the language does not have."""
     start = len(line) - len(line.lstrip())
     if start == len(line):
         raise InvalidExpression("the expression is empty; write e.g. 2**2 - norm2(a2 - a3)")
@@ -216,7 +221,7 @@ def _syntax(line: str) -> ast.expr:
 
 
 class _Translator:
-    """From Python's syntax to our tree: what `_ALLOWED` names passes, anything else is refused. Literals are folded on the way."""
+    """Translates Python's syntax tree to a tree of `_Node`s. Accepts only the syntax listed in `_ALLOWED`; folds literals."""
 
     def __init__(self, line: str) -> None:
         self.encoded = line.encode(errors="replace")  # the parser counts bytes
@@ -251,7 +256,7 @@ class _Translator:
         return self.agent(node, value)
 
     def name(self, node: ast.Name) -> _Node:
-        name = self.segment(node)  # not node.id, where letters are normalised: they tell one agent from another
+        name = self.segment(node)  # not node.id: Python normalises its letters, which could merge two agent ids
         if name in _FUNCTIONS:
             self.fault(node, f"{_usage(name)} is a function; an agent with this id is written '{name}'")
         if name == "t":
@@ -267,7 +272,7 @@ class _Translator:
         return operand if isinstance(node.op, ast.UAdd) else _apply("-", self.column(node), operand)
 
     def sum(self, node: ast.BinOp) -> _Node:
-        """``p + q - r + …`` is one operation on many terms, so that a long sum is not a deep one."""
+        """Translates ``p + q - r + …`` to one operation on many terms, so that a long sum is not a deep tree."""
         chain = [node]
         while isinstance(chain[-1].left, ast.BinOp) and isinstance(chain[-1].left.op, ast.Add | ast.Sub):
             chain.append(chain[-1].left)
@@ -363,7 +368,7 @@ def _number(value: float, column: int) -> _Node:
 
 
 def _apply(operation: str, column: int, *operands: _Node, details: tuple[float, ...] = ()) -> _Node:
-    """The operation, or the number that it gives if all its operands are literals."""
+    """The node of an operation, or of its value if all its operands are literals."""
     fold = _OPERATIONS[operation].fold
     if fold is None or any(operand.operation != "number" for operand in operands):
         return _Node(operation, operands, details, column)
@@ -375,7 +380,7 @@ def _apply(operation: str, column: int, *operands: _Node, details: tuple[float, 
 
 
 def _lift(node: _Node, numbers: list[float]) -> _Node:
-    """The tree with every literal replaced by its index in `numbers`, to which it is appended."""
+    """The tree with each literal replaced by its index in `numbers`. Appends the literals to `numbers`."""
     if node.operation == "number":
         numbers.append(node.details[0])
         return replace(node, details=(len(numbers) - 1,))

@@ -1,4 +1,4 @@
-"""Functions for use inside a constraint whose derivatives JAX would otherwise get wrong."""
+"""Functions for use in constraints, with derivatives that stay finite where those of JAX are NaN."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from jax import Array
 def safe_norm(v: Array) -> Array:
     """‖v‖, with gradient 0 at v = 0, where `jax.numpy.linalg.norm` has NaN.
 
-    0 is a subgradient there, so gradient inequalities such as those behind a certificate keep holding. Second derivatives at 0 are
-    finite, but arbitrary: the norm has none. `consat.problem.constraints.curvature` reads it as the convex function that it is.
+    0 is a subgradient at v = 0, so the gradient inequalities used by certificates hold. Second derivatives at 0 are finite but arbitrary:
+    the norm has none there. `consat.problem.constraints.curvature` recognises the function as convex.
 
     Args:
         v: shape (n,).

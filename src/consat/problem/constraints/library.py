@@ -1,6 +1,6 @@
-"""The library kinds. Each is a pure function ψ and a factory that names its parameters; `KINDS` makes it known to scenario files.
+"""The library kinds of constraints. Each kind is a pure function ψ and a factory with its parameters; `KINDS` lists the factories.
 
-To add a kind, write the same two things and list the factory.
+To add a kind, write these two functions and add the factory to `KINDS`. Scenario files can then use it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from consat.problem.constraints.record import OWNER, Constraint, Fixed, Number, 
 from consat.problem.schedule import CLOCK, Schedule
 
 Other: TypeAlias = "str | int | Sequence[int] | Mapping[str, int] | np.ndarray"
-"""Whom a constraint reads besides its owner."""
+"""The agent that a constraint reads besides its owner: an id, or in a group a relation; see `consat.problem.groups`."""
 
 
 def _within(x: Array, *, center: Array, radius: Array) -> Array:
@@ -91,11 +91,11 @@ def _displacement(x: Array, y: Array, *, vector: Array, radius: Array) -> Array:
 
 
 def displacement(agent: Other, vector: ArrayLike, radius: float, *, name: str | None = None, weight: float = 1.0) -> Constraint:
-    """Hold a place relative to a teammate: ψ = r² − ‖x_i − x_j − v‖². Concave.
+    """Hold a position relative to a teammate: ψ = r² − ‖x_i − x_j − v‖². Concave.
 
     Args:
         agent: id of j; in a group also a relation, see `consat.problem.groups`.
-        vector: v, shape (d,), length: where i should be, seen from j.
+        vector: v, shape (d,), length: desired position of i relative to j.
         radius: r > 0, length.
         name: what reports call it.
         weight: positive factor on ψ.
@@ -141,7 +141,7 @@ def box(low: ArrayLike, high: ArrayLike, *, name: str | None = None, weight: flo
     first = low.values if isinstance(low, Schedule) else low.get("values") if isinstance(low, Mapping) else [low]
     side = first[0] if isinstance(first, list | tuple | np.ndarray) and len(first) else low
     size = len(side) if isinstance(side, list | tuple) else np.size(side)
-    axes = np.eye(min(max(size, 1), 64))  # a size that is not the team's dimension is for the team to refuse
+    axes = np.eye(min(max(size, 1), 64))  # the team reports a size that is not its dimension
     lows = [
         Constraint("box", _above, (OWNER,), {"low": Vector(low), "axis": Fixed(axis)}, f"{label}.low[{k}]", weight)
         for k, axis in enumerate(axes)
@@ -154,15 +154,15 @@ def box(low: ArrayLike, high: ArrayLike, *, name: str | None = None, weight: flo
 
 
 def expr(psi: str, *, name: str | None = None, weight: float = 1.0) -> Constraint:
-    """Any differentiable ψ as text, e.g. ``"2**2 - norm2(a2 - a3)"``; the agents involved are read off it.
+    """A constraint with ψ given as text, e.g. ``"2**2 - norm2(a2 - a3)"``. The text names the agents that ψ reads.
 
     Args:
-        psi: the expression; see `consat.problem.constraints.expression` for the language. It must read its owner's position.
+        psi: the expression; see `consat.problem.constraints.expression` for the language. It must read the position of its owner.
         name: what reports call it.
         weight: positive factor on ψ.
 
     Raises:
-        InvalidExpression: the text is not in the language; says where and what would be.
+        InvalidExpression: the text is not in the language. The message says where, and what would be right.
     """
     parsed = Expression.parse(psi)
     parameters: dict[str, Parameter] = {"numbers": Fixed(parsed.numbers)}
@@ -174,16 +174,16 @@ def expr(psi: str, *, name: str | None = None, weight: float = 1.0) -> Constrain
 def constraint(
     psi: Callable[..., Any], reads: Sequence[str], *, name: str | None = None, weight: float = 1.0, **parameters: ArrayLike
 ) -> Constraint:
-    """Your own ψ as a Python function of positions, traced by JAX: no gradient to write, nothing else to declare.
+    """A constraint with ψ given as a Python function of positions. JAX traces and differentiates it.
 
     Args:
         psi: ``psi(*positions, **parameters) -> scalar``, written with `jax.numpy`; each position is a (d,) array.
             Constraints that share one function are evaluated together, so define it once and vary `parameters`.
-        reads: the agents whose positions `psi` takes, in that order; the owner among them.
+        reads: ids of the agents whose positions `psi` takes, in order; the owner must be among them.
         name: what reports call it.
         weight: positive factor on ψ.
-        parameters: arrays that `psi` takes by keyword, or schedules of them. One that `psi` calls ``t``, and that is not given, is the
-            time, s.
+        parameters: keyword arguments of `psi`: arrays, or schedules of arrays. If `psi` has an argument ``t`` that is not given here, it
+            receives the time, s.
     """
     kind = getattr(psi, "__name__", "constraint").strip("<>")
     given: dict[str, Any] = {"t": CLOCK} if "t" not in parameters and _reads_time(psi, len(reads)) else {}
@@ -191,7 +191,7 @@ def constraint(
 
 
 def _reads_time(psi: Callable[..., Any], positions: int) -> bool:
-    """Whether a function has, beside so many positions, an argument named ``t``."""
+    """Whether a function has an argument named ``t`` after its `positions` positional arguments, or by keyword only."""
     try:
         arguments = list(inspect.signature(psi).parameters.values())
     except (TypeError, ValueError):
@@ -210,17 +210,20 @@ ADJUSTABLE: Final[Mapping[Callable[..., Any], Mapping[str, Parameter]]] = {
     _above: {"low": _POINT},
     _below: {"high": _POINT},
 }
-"""Of every function of the library the parameters that can be changed, and what these may be. None of them changes how it bends."""
+"""Parameters of each library function that can be changed while a team runs, and what their values must satisfy. None of them changes the
+curvature."""
 
 
 def farthest(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray], center: np.ndarray) -> float:
-    """How far from a place, (d,), the nearest position is that satisfies the one of some constraints that asks for most, as far as the
-    library knows; of `displacement` how far apart it keeps two agents.
+    """The largest distance from `center` that any constraint of a family requires of a position, length.
+
+    For `displacement`, the largest distance that it requires between two agents. 0 if nothing is required, or for functions that are not
+    listed here.
 
     Args:
-        psi: the function of these constraints.
+        psi: the function of the family.
         parameters: arrays with leading axis M.
-        center: the place, length.
+        center: (d,) reference position, length.
     """
     p = {key: np.asarray(value, dtype=float) for key, value in parameters.items()}
     if psi is _within:
@@ -239,8 +242,14 @@ def farthest(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray], cent
 
 
 def adjustable(psi: Callable[..., Any], parameters: Iterable[str]) -> Mapping[str, Parameter]:
-    """Which of its parameters can be changed in a constraint, and what these may be; none in a text expression, where numbers have no
-    names."""
+    """The parameters of a constraint that can be changed while a team runs, and what their values must satisfy.
+
+    None for a text expression, because its numbers have no names.
+
+    Args:
+        psi: the function of the constraint.
+        parameters: names of its parameters.
+    """
     if isinstance(psi, Formula):
         return {}
     return ADJUSTABLE[psi] if psi in ADJUSTABLE else {key: Fixed(None) for key in parameters if key != "t"}
@@ -249,4 +258,4 @@ def adjustable(psi: Callable[..., Any], parameters: Iterable[str]) -> Mapping[st
 KINDS: Final[Mapping[str, Callable[..., Constraint | list[Constraint]]]] = {
     factory.__name__: factory for factory in (within, outside, near, apart, displacement, halfspace, box, expr)
 }
-"""What ``kind:`` may say in a scenario file; the keys of a constraint there are the arguments of its factory."""
+"""Factories by the name that ``kind:`` uses in a scenario file. The other keys of a constraint there are the arguments of its factory."""

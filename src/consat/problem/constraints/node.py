@@ -1,6 +1,6 @@
-"""What is known of an intermediate array as a function of the positions, element by element, of a whole family at once.
+"""`Node`: proven properties of an intermediate array of ψ as a function of the positions, for each element and each member of a family.
 
-The axes of a node's arrays are (members, *shape, *more); any of them may have length 1 and then stands for equal entries.
+The axes of a node's arrays are (members, *shape, *more). An axis of length 1 stands for equal entries.
 """
 
 from __future__ import annotations
@@ -16,15 +16,19 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 ROUNDING: Final = 1e-12
-"""An eigenvalue below this, per row of its matrix, is zero, once every coordinate is scaled such that the terms summed into the matrix
-are at most 1. That is some thousand roundings, more than any constraint makes."""
+"""Tolerance for eigenvalues, per row of the matrix: smaller ones count as 0. It applies after scaling each coordinate so that the terms
+summed into the matrix are at most 1. It allows some thousand rounding errors, more than any constraint makes."""
 
 
 def signs(matrix: Array, size: Array, rounding: float = ROUNDING) -> tuple[Array, Array]:
-    """Signs of the smallest and the largest eigenvalue of symmetric matrices; −1 and 1 if not finite.
+    """Signs of the smallest and the largest eigenvalue of symmetric matrices; −1 and 1 if a matrix is not finite.
 
-    By Sylvester's law of inertia a congruence keeps them, so each coordinate is first scaled to a unit of its own, such that no row of
-    `size`, which bounds the terms that were added up to `matrix`, exceeds 1. What then lies below `rounding`, per row, counts as 0.
+    Each coordinate is first scaled so that the entries of `size` are at most about 1. By Sylvester's law of inertia this keeps the signs.
+
+    Args:
+        matrix: (…, n, n) symmetric matrices.
+        size: (…, n, n) bounds on the sums of absolute terms that were added up to `matrix`.
+        rounding: scaled eigenvalues up to n times this count as 0.
     """
     matrix, size = np.broadcast_arrays(matrix, size)
     finite = np.asarray(np.isfinite(size + matrix).all((-1, -2)))
@@ -41,20 +45,20 @@ def signs(matrix: Array, size: Array, rounding: float = ROUNDING) -> tuple[Array
 
 
 def block(matrix: Array, slot: int | None) -> Array:
-    """Of a Hessian (…, arity, d, arity, d) the (d, d) block of one position, or if None all of it as a square matrix."""
+    """The (d, d) block of one position in a Hessian (…, arity, d, arity, d). If `slot` is None, the whole Hessian as a square matrix."""
     n = math.prod(matrix.shape[-2:])
     return matrix.reshape(*matrix.shape[:-4], n, n) if slot is None else matrix[..., slot, :, slot, :]
 
 
 class Bend(NamedTuple):
-    """How a function bends, proven element by element. Affine is both convex and concave.
+    """The proven curvature of a function, for each element. An affine function is both convex and concave.
 
     Attributes:
         convex: bool.
         concave: bool.
-        logconvex: bool; positive, with a convex logarithm (hence convex).
-        strict: bool, with one more axis of length arity + 2. Given that the element is convex or concave, whether it is
-            strictly so: jointly, in each position alone, and (last) in the weakest sense, not affine.
+        logconvex: bool; positive with a convex logarithm, hence convex.
+        strict: bool, with one more axis of length arity + 2: if the element is convex or concave, whether it is strictly so jointly
+            (entry 0), strictly so in each position alone (entries 1 to arity), and not affine (last entry).
     """
 
     convex: Array
@@ -65,17 +69,17 @@ class Bend(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """What an intermediate array is as a function of the positions.
+    """Proven properties of an intermediate array as a function of the positions.
 
     Attributes:
-        shape: of the array.
-        degree: bound on the polynomial degree, if proven to be ≤ 2.
-        low: lower bound, where the function is defined.
-        high: upper bound, likewise.
-        terms: (c, b, H) of c + b·x + ½ xᵀHx up to the degree, if known: b has two more axes (arity, d), H four.
-        sizes: the same sums with every term positive: what rounding errors are relative to.
-        rule: how it bends, for lack of terms.
-        made: by which rule and of what, for rules that look further back than one step.
+        shape: shape of the array, for one member.
+        degree: upper bound on the polynomial degree, if proven to be ≤ 2; else None.
+        low: lower bound on the values, where the function is defined.
+        high: upper bound on the values, where the function is defined.
+        terms: coefficients (c, b, H) of c + b·x + ½ xᵀHx, up to the degree; None if unknown. b has two more axes (arity, d), H has four.
+        sizes: the same sums over absolute values: the scale of the rounding errors in `terms`.
+        rule: curvature, if `terms` is None.
+        made: name of the operation and its operands, for rules that look back more than one step.
     """
 
     shape: tuple[int, ...]
@@ -94,7 +98,7 @@ class Node:
 
     @cached_property
     def bend(self) -> Bend:
-        """How it bends; of a quadratic by its eigenvalues."""
+        """The curvature; from the eigenvalues of the Hessian if the function is a quadratic."""
         one, more = (1,) * (len(self.shape) + 1), (1,)
         no, yes, none = np.zeros(one, bool), np.ones(one, bool), np.zeros(one + more, bool)
         if self.value is not None:
@@ -113,7 +117,7 @@ class Node:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """`low` and `high`, sharpened by the sign of a quadratic, if it is clear."""
+        """`low` and `high`, tightened to 0 where a quadratic is clearly ≥ 0 or ≤ 0 everywhere."""
         if self.degree != 2 or self.terms is None:
             return self.low, self.high
         opposite = replace(self, terms=tuple(-term for term in self.terms))
@@ -121,7 +125,12 @@ class Node:
         return np.where(above, np.maximum(self.low, 0), self.low), np.where(below, np.minimum(self.high, 0), self.high)
 
     def nonnegative(self, margin: float, rounding: float = ROUNDING) -> Array:
-        """Whether a quadratic is ≥ 0 everywhere, even if its constant term were less by `margin`: iff [[H, b], [bᵀ, 2c]] is so definite."""
+        """Whether a quadratic is ≥ 0 everywhere: iff [[H, b], [bᵀ, 2c]] is positive semidefinite.
+
+        Args:
+            margin: the last diagonal entry of the matrix, 2c, is first reduced by this fraction of its size.
+            rounding: as in `signs`.
+        """
         matrix, size = _lifted(self.terms or ()), _lifted(self.sizes)
         matrix[..., -1, -1] -= margin * size[..., -1, -1]
         return signs(matrix, size, rounding)[0] >= 0
@@ -139,7 +148,7 @@ def _lifted(terms: tuple[Array, ...]) -> Array:
 
 
 def constant(value: Any) -> Node:
-    """A known constant; its first axis runs over the members."""
+    """The node of a known constant. The first axis of `value` runs over the members."""
     value = np.asarray(value)
     if value.dtype.kind not in "biuf":
         return opaque(value.shape[1:])
@@ -148,18 +157,18 @@ def constant(value: Any) -> Node:
 
 
 def opaque(shape: tuple[int, ...]) -> Node:
-    """A constant of unknown value."""
+    """The node of a constant with unknown value."""
     return unknown(shape, 0)
 
 
 def unknown(shape: tuple[int, ...], degree: int | None = None) -> Node:
-    """A function of which nothing else is known."""
+    """The node of a function of which only the shape and perhaps the degree are known."""
     infinite = np.full((1,) * (len(shape) + 1), np.inf)
     return Node(shape, degree, -infinite, infinite)
 
 
 def position(slot: int, arity: int, dimension: int) -> Node:
-    """The position in one of the slots of ψ."""
+    """The node of the position that is argument number `slot` of ψ."""
     gradient = np.zeros((1, dimension, arity, dimension))
     gradient[0, :, slot, :] = np.eye(dimension)
     return replace(unknown((dimension,), 1), terms=(np.zeros((1, dimension)), gradient), sizes=(np.zeros((1, dimension)), gradient))

@@ -1,4 +1,4 @@
-"""The one form that every constraint takes, whoever wrote it: library kind, Python callable or text expression."""
+"""`Constraint`: the common record for library kinds, Python functions and text expressions."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
 OWNER: Final = "@owner"
-"""Stands in `Constraint.reads` for the agent that will own the constraint."""
+"""Placeholder in `Constraint.reads` for the agent that owns the constraint."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A real parameter of a constraint and the values it may take; `consat.Team` checks it."""
+    """A scalar parameter; `consat.Team` checks its value.
+
+    Attributes:
+        value: the value as given.
+        positive: whether it must be positive.
+    """
 
     value: Any
     positive: bool = False
@@ -20,10 +25,12 @@ class Number:
 
 @dataclass(frozen=True)
 class Vector:
-    """A parameter in R^d; `consat.Team` checks it against its dimension.
+    """A vector parameter in R^d; `consat.Team` checks its value.
 
     Attributes:
-        above: if given, every entry must exceed the entry of this vector, which is the parameter ``low``.
+        value: the value as given.
+        nonzero: whether it must differ from 0.
+        above: if given, a vector that each entry must exceed: the parameter ``low`` of a box.
     """
 
     value: Any
@@ -33,7 +40,7 @@ class Vector:
 
 @dataclass(frozen=True)
 class Fixed:
-    """A parameter that its factory made and vouches for."""
+    """A parameter without restrictions, except that it must be numeric."""
 
     value: Any
 
@@ -45,18 +52,18 @@ Parameter = Number | Vector | Fixed
 class Constraint:
     """A private constraint ψ > 0 of one agent (paper, eq. 4).
 
-    Constraints that share `psi` and the number of positions it reads form one family and are evaluated by one `jax.vmap`,
-    so `psi` should be a module-level function and everything that varies between constraints a parameter.
+    Constraints with the same `psi` and the same number of positions form one family, which one `jax.vmap` evaluates. So `psi` should be a
+    module-level function, and everything that varies between constraints should be a parameter.
 
     Attributes:
         kind: the name that errors and reports use, e.g. ``within``.
         psi: ``psi(*positions, **parameters) -> scalar``, JAX-traceable and continuously differentiable; each position is a (d,) array.
-        reads: the agents whose positions `psi` takes, in that order; `OWNER` stands for the owner, and in a group
-            what is no text for whom a relation leads to (`consat.problem.groups`).
-        parameters: the keyword arguments of `psi`.
-        name: what the user calls it; if None, the team derives one from the kind and the agents read.
+        reads: ids of the agents whose positions `psi` takes, in order. `OWNER` stands for the owner. In a group, an entry that is not a
+            text is a relation; see `consat.problem.groups`.
+        parameters: keyword arguments of `psi`.
+        name: name given by the user. If None, the team derives one from the kind and the agents read.
         weight: positive factor on ψ.
-        source: the text it was written as, for text expressions.
+        source: text of ψ, if it was written as a text expression.
     """
 
     kind: str
@@ -69,11 +76,11 @@ class Constraint:
 
 
 Constraints: TypeAlias = "Sequence[Constraint | Sequence[Constraint]]"
-"""Constraints of an agent: what `consat.within` and its like return, a list of them where that is a list (`consat.box`)."""
+"""Constraints of an agent. An item is a constraint, or a list of constraints such as `consat.box` returns."""
 
 
 def flatten(item: Any) -> Iterator[Any]:
-    """The constraints of a list that may nest."""
+    """Yields the items of a list that may be nested, or the item itself if it is no list."""
     if isinstance(item, list | tuple):
         for part in item:
             yield from flatten(part)

@@ -1,4 +1,4 @@
-"""Traces read as functions of the positions: `interpret` walks a jaxpr, `describe` knows what each primitive does to a `Node`.
+"""Abstract interpretation of traces: `interpret` evaluates a jaxpr on any kind of value, `describe` applies one primitive to `Node`s.
 
 A primitive without a rule yields an unknown function, never a guess.
 """
@@ -24,7 +24,7 @@ Array = NDArray[Any]
 T = TypeVar("T")
 
 CALLS: Final = frozenset({"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"})
-"""Primitives whose value is that of the jaxpr they carry."""
+"""Primitives that call an inner jaxpr and return its value."""
 
 
 def interpret(
@@ -37,9 +37,12 @@ def interpret(
 
     Args:
         closed: the jaxpr.
-        arguments: what stands for its inputs.
-        constant: makes such a value of a number or array.
-        step: evaluates one equation, or answers None to one of `CALLS`, whose body is then entered.
+        arguments: values of its inputs.
+        constant: converts a number or array to such a value.
+        step: evaluates one equation. It may return None for one of `CALLS`; then the inner jaxpr is evaluated.
+
+    Returns:
+        the values of its outputs.
     """
     env: dict[Any, T] = dict(zip(closed.jaxpr.invars, arguments, strict=True))
     env.update(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
@@ -55,13 +58,13 @@ def interpret(
 
 
 def body(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
-    """The jaxpr that one of `CALLS` carries."""
+    """The inner jaxpr of an equation whose primitive is one of `CALLS`."""
     inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
     return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
 
 
 def evaluate(eqn: core.JaxprEqn, *inputs: Any) -> list[Any]:
-    """One equation, not of `CALLS`, on arrays."""
+    """Evaluates one equation on arrays. Its primitive must not be one of `CALLS`."""
     out = eqn.primitive.bind(*inputs, **eqn.params)
     return list(out) if eqn.primitive.multiple_results else [out]
 
@@ -90,7 +93,7 @@ RULES: Final[Mapping[str, Rule]] = {
     "logaddexp": lambda a, b: atom("log", plus(atom("exp", a), atom("exp", b))),
     **{name: (lambda a, name=name, **_: atom(name, a)) for name in ATOMS},
 }
-"""What a primitive does to nodes. One that is missing makes an unknown function."""
+"""Rules for primitives: from the nodes of the operands to the node of the result."""
 
 MOVERS: Final[Mapping[str, Callable[..., Any] | None]] = {
     "copy": lambda _into, a, **_: a,
@@ -110,7 +113,7 @@ MOVERS: Final[Mapping[str, Callable[..., Any] | None]] = {
     "select_n": lambda _into, which, *cases, **_: np.choose(which.astype(int), cases),
     **dict.fromkeys(("pad", "gather", "dynamic_slice", "dynamic_update_slice", "scatter"), None),
 }
-"""Primitives that only rearrange entries, as they act on entry numbers; None: let JAX do it."""
+"""Primitives that only rearrange entries, as functions on arrays of entry numbers. None: JAX evaluates the primitive itself."""
 
 SELECTORS: Final[Mapping[str, slice]] = {
     "select_n": slice(0, 1),
@@ -119,16 +122,16 @@ SELECTORS: Final[Mapping[str, slice]] = {
     "dynamic_update_slice": slice(2, None),
     "scatter": slice(1, 2),
 }
-"""Which operands of those say where entries go; they must be known, and the same for all members."""
+"""Operands of `MOVERS` that are indices. Their values must be known and equal for all members."""
 
 
 def _avals(variables: Sequence[Any]) -> list[Any]:
-    """Their shapes and types."""
+    """Shapes and types of variables of a jaxpr."""
     return [variable.aval for variable in variables]
 
 
 def describe(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> Sequence[Node] | None:
-    """The step of `interpret` for nodes: what the outputs of an equation are, given what its inputs are."""
+    """The nodes of the outputs of an equation, given those of its inputs. The `step` of `interpret` for nodes."""
     name, outputs = eqn.primitive.name, _avals(eqn.outvars)
     if name in CALLS:
         return [RULES["logaddexp"](*inputs)] if _is_logaddexp(eqn) else None
@@ -148,7 +151,7 @@ def describe(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> Sequence[Node] | Non
 
 
 def _is_logaddexp(eqn: core.JaxprEqn) -> bool:
-    """Whether a call is `jax.numpy.logaddexp`, by what it does, not by its name."""
+    """Whether a call is `jax.numpy.logaddexp`: its inner jaxpr is compared, not its name."""
     if eqn.primitive.name != "custom_jvp_call" or len(eqn.invars) != 2:
         return False
     operands = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in _avals(eqn.invars)]
@@ -157,7 +160,10 @@ def _is_logaddexp(eqn: core.JaxprEqn) -> bool:
 
 
 def _moved(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> list[Node] | None:
-    """What a primitive that rearranges entries does, found by letting it rearrange their numbers."""
+    """The nodes of the outputs of a primitive that rearranges entries; None if it cannot be determined.
+
+    The primitive is applied to the numbers of the entries, which shows where each entry goes.
+    """
     name, outputs = eqn.primitive.name, _avals(eqn.outvars)
     if not np.issubdtype(outputs[0].dtype, np.floating):
         return None
@@ -177,12 +183,12 @@ def _moved(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> list[Node] | None:
     act = MOVERS[name]
     moved = evaluate(eqn, *operands) if act is None else act(outputs[0].shape, *operands, **eqn.params)
     indices = [np.asarray(index) for index in (moved if isinstance(moved, list) else [moved])]
-    inside = all(np.all((index >= 0) & (index < total)) for index in indices)  # out of bounds, a gather fills
+    inside = all(np.all((index >= 0) & (index < total)) for index in indices)  # a gather with indices out of bounds inserts fill values
     return [arranged(entries, index) for index in indices] if inside else None
 
 
 def _evaluated(eqn: core.JaxprEqn, values: Sequence[Array]) -> list[Array]:
-    """A primitive applied to known constants."""
+    """The outputs of a primitive applied to known constants, whose first axis runs over the members."""
     typed = [np.broadcast_to(v, (len(v), *aval.shape)).astype(aval.dtype) for v, aval in zip(values, _avals(eqn.invars), strict=True)]
     if all(len(value) == 1 for value in typed):
         return [np.asarray(out)[None] for out in evaluate(eqn, *(value[0] for value in typed))]
