@@ -1,5 +1,5 @@
-"""What an observer who sees the whole team can prove: the best margin, bounds, which assumptions hold, and reasons in words.
+"""Proofs by an observer of the whole team: the best margin, bounds on it, the paper's assumptions, and reasons in words.
 
-In: a team, and positions. Out: `optimum.Optimum`, `certificate.Certificate`, sentences. The counterpart of `consat.protocols`, which see
-one agent; the two never import each other.
+Input: a team and positions. Output: `optimum.Optimum`, `certificate.Certificate`, sentences. `consat.protocols` is the counterpart for one
+agent; the two packages never import each other.
 """

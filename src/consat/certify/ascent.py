@@ -1,9 +1,8 @@
-"""Many starts climb the smooth margin at once, by ν-continuation: where the exact max-min of a team that is not quadratic is looked for.
+"""Multi-start gradient ascent on the smooth margin with increasing ν. It finds candidates for the max-min of teams that are not quadratic.
 
-    β_c(x) = −(1/ν) ln Σ_{k in cluster c} e^{−ν ψ_k(x)},    ν from soft to sharp
+    β_c(x) = −(1/ν) ln Σ_{k in cluster c} e^{−ν ψ_k(x)},    ν increasing
 
-Every start and every cluster goes its own way, with exact gradients and a step length of its own (Barzilai, Borwein 1988), taken back where
-β_c falls.
+Each start and each cluster has its own step length (Barzilai, Borwein 1988). Gradients are exact. A step that lowers β_c is rejected.
 """
 
 from __future__ import annotations
@@ -22,19 +21,25 @@ from consat.problem.team import Team
 from consat.problem.units import SHARPNESS, Scale, start_box
 
 LADDER = (0.2, 1.0, 5.0, 25.0)
-"""ν in units of the automatic one: the first sees far, the last is close to the minimum itself."""
+"""Values of ν, in units of the automatic ν. The first smooths strongly; with the last, β_c is close to the minimum of ψ."""
 STEPS = 150
-"""Steps at each ν; what is not reached by then is left to Newton's method."""
+"""Number of steps at each ν. The result is refined later; see `consat.certify.optimum`."""
 REACH = 0.5
-"""The longest step of an agent, in lengths of the team."""
+"""Longest step of an agent, in natural lengths of the team; see `consat.problem.units`."""
 
 
 @float64
 def climb(team: Team, first: Floats, cluster: Ints, size: Scale) -> tuple[Floats, Floats]:
-    """Climb from (S, N, d) starts.
+    """Gradient ascent from many starts.
+
+    Args:
+        team: the team.
+        first: (S, N, d) starts, length.
+        cluster: (N,) cluster of each agent.
+        size: natural scales of the team.
 
     Returns:
-        (S, N, d) formations and (S, C) margins of their clusters, −∞ where ψ is not defined.
+        (S, N, d) formations, length, and (S, C) margins of their clusters; −∞ where a ψ is not defined.
     """
     count = int(cluster.max(initial=-1)) + 1
     objective, groups, agents = Objective.at_positions(team), Groups.of(cluster[team.owner], count), Groups.of(cluster, count)
@@ -45,7 +50,7 @@ def climb(team: Team, first: Floats, cluster: Ints, size: Scale) -> tuple[Floats
 
 
 def drawn(team: Team, count: int, seed: int, size: Scale) -> Floats:
-    """(count, N, d) starts, uniform in the box where runs start by default."""
+    """(count, N, d) random starts, uniform in the default start box, length."""
     low, high = start_box(size)
     return np.random.default_rng(seed).uniform(low, high, (count, team.count, team.dimension))
 

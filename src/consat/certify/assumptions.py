@@ -1,12 +1,11 @@
-"""What must hold for a team to be solved, and whether it does: connected communication, one cluster, compact level sets (paper,
-Assumptions 1 to 3), convexity and a unique optimum (design, section 7).
+"""Checks of the paper's Assumptions 1 to 3 (connected communication, one cluster, compact level sets), convexity and a unique optimum.
 
 For concave ψ_k = c_k + b_k·y + ½ yᵀH_k y the level sets are compact iff
 
-    {d : H_k d = 0 and b_k·d ≥ 0 for all k} = {0},
+    {d : H_k d = 0 and b_k·d ≥ 0 for all k} = {0}.
 
-and then the minimiser of f exists and is unique; otherwise there is none or a whole line of them (`recession`). Constraints beyond
-degree 2 can only shrink the level sets.
+Then the minimiser of f exists and is unique. Otherwise there is no minimiser, or a whole line of them; see `recession`. Constraints of
+higher degree can only shrink the level sets.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from consat.problem.units import scale
 
 SCHEMA = "consat.check/1"
 MOST_LISTED = 10_000
-"""Above this many agents the report leaves out what it says of each."""
+"""Above this many agents the report leaves out the lists of agents and constraints."""
 AUXILIARY = "auxiliary"
-"""The name of the constraints that `with_auxiliary` adds."""
+"""Name of the constraints that `with_auxiliary` adds."""
 
 
 def report(team: Team) -> dict[str, Any]:
-    """What ``check --json`` prints (schema consat.check/1).
+    """The report that ``check --json`` prints (schema consat.check/1).
 
-    ``agents`` (their ids), ``clusters`` and ``constraints`` are null above `MOST_LISTED` agents.
+    ``agents`` (ids), ``clusters``, ``relays`` and ``constraints`` are null above `MOST_LISTED` agents.
     """
     shape, cluster = shape_of(team), clusters(team)
     listed = team.count <= MOST_LISTED
@@ -60,9 +59,13 @@ def report(team: Team) -> dict[str, Any]:
 
 
 def existence(team: Team) -> tuple[bool | None, bool | None, list[str]]:
-    """Whether level sets are compact, whether f has exactly one minimiser (None: not known), and who can drift off without loss.
+    """Existence and uniqueness of the optimum.
 
-    Agents whose position no constraint reads are left out: where they are does not matter.
+    Agents whose position no constraint reads are left out: their position does not matter.
+
+    Returns:
+        whether the level sets are compact, whether f has exactly one minimiser (None: unknown), and the ids of agents that can move to
+        infinity without any ψ getting worse (empty unless the level sets are proven not compact).
     """
     shape = shape_of(team)
     model = expand(team, np.full((team.count, team.dimension), scale(team).center))
@@ -78,17 +81,17 @@ def existence(team: Team) -> tuple[bool | None, bool | None, list[str]]:
         unique = False if everything.invariant else None
         adrift = everything.adrift
     elif shape.concave.all():
-        unique = bounded  # given concavity the two are the same, see the head of this file
+        unique = bounded  # equivalent for concave constraints; see the docstring of this module
     return bounded, unique, [team.ids[i] for i in np.flatnonzero(adrift).tolist()] if bounded is False else []
 
 
 def with_auxiliary(team: Team, radius: float, center: ArrayLike | None = None) -> Team:
-    """The same team with ψ = radius² − ‖x_i − o‖² added for every agent, which restores compact level sets and a unique optimum.
+    """The team with an auxiliary constraint ψ = radius² − ‖x_i − o‖² for each agent, so that level sets are compact and the optimum unique.
 
     Args:
         team: the team.
-        radius: √c_aux > 0, length; large enough not to bind, see `binding_auxiliaries`.
-        center: o, (d,); by default the centre that the constraints point to.
+        radius: √c_aux > 0, length. It should be too large to bind; see `binding_auxiliaries`.
+        center: o, (d,), length. If None, the natural centre of the team; see `consat.problem.units`.
     """
     ball = within(np.zeros(team.dimension) if center is None else center, radius)
     o = scale(team).center if center is None else np.asarray(center, dtype=float)
@@ -108,12 +111,12 @@ def with_auxiliary(team: Team, radius: float, center: ArrayLike | None = None) -
 
 
 def binding_auxiliaries(team: Team, multipliers: Floats, threshold: float = 1e-6) -> list[str]:
-    """The agents whose auxiliary constraint takes part in the optimum: then the radius is too small.
+    """The ids of agents whose auxiliary constraint binds at the optimum. If there are any, the radius is too small.
 
     Args:
-        team: as `with_auxiliary` returned it.
-        multipliers: (M,) of its optimum.
-        threshold: what a solver leaves to a constraint that does not bind.
+        team: a team returned by `with_auxiliary`.
+        multipliers: (M,) multipliers of its optimum.
+        threshold: multipliers up to this count as 0; solvers leave small residues.
     """
     return [team.ids[int(team.owner[k])] for k in np.flatnonzero(multipliers > threshold).tolist() if team.names[k] == AUXILIARY]
 
@@ -138,7 +141,7 @@ def _constraints(team: Team) -> list[dict[str, Any]]:
 
 
 def _relays(team: Team, cluster: Ints) -> list[dict[str, Any]]:
-    """Who passes on messages of a cluster that is not its own, and the agents of that cluster."""
+    """The relays, each with the ids of the agents of the cluster it serves; see `consat.problem.graphs.relays`."""
     return [
         {"agent": team.ids[i], "for": [team.ids[int(k)] for k in np.flatnonzero(cluster == c)]}
         for c, joining in relays(team, cluster).items()

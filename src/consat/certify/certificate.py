@@ -1,13 +1,14 @@
-"""What is proven of a team: bounds on the best margin any formation can have, and the verdict that follows.
+"""Certificates: proven bounds on the best margin that any formation of a team can have, and the resulting verdict.
 
-Let ψ_k be concave, λ ≥ 0 with Σ λ = 1. A formation x that is better than x̂ has β̄(x) ≤ Σ λ_k ψ_k(x), and, as this sum is concave,
+Let ψ_k be concave and λ ≥ 0 with Σ λ = 1. For each formation x that is better than x̂, β̄(x) ≤ Σ λ_k ψ_k(x). This sum is concave, so
 
     β̄(x) ≤ q(z) + ∇q(z)·(x − z) ≤ q(z) + Σ_i ‖∇_i q(z)‖ (R_i + ‖z_i − x̂_i‖),    q = Σ λ_k ψ_k,
 
-for ANY point z, R_i being how far better formations lie at most (`levels`). So no solver need be trusted: λ and z only decide how
-sharp the bound is. z is Newton's maximiser of q, exact for quadratics; λ are softmax weights at x̂ over a ladder of ν, those at points
-found by climbing centrally (`refine`), and whatever the caller brings. Constraints that are not concave get no weight: what proves that
-the others cannot hold together proves it of all. Clusters have bounds of their own; those of the team are the smallest.
+for ANY point z, where R_i bounds ‖x_i − x̂_i‖ for all better formations (`levels`). The bound is valid for any λ and z, so no solver has to
+be trusted: λ and z only decide how tight it is. z is the maximiser of q by Newton's method, exact for quadratics. The λ tried are softmax
+weights at x̂ for several ν, those at points found by a central ascent (`refine`), and those given by the caller. Constraints that are not
+concave get weight 0: if the others cannot hold together, neither can all. Each cluster has its own bounds; those of the team are the
+smallest.
 """
 
 from __future__ import annotations
@@ -31,39 +32,39 @@ from consat.problem.team import Team
 Verdict = Literal["feasible", "infeasible", "undecided"]
 
 RUNGS = 4.0 ** np.arange(0, 7)
-"""ν times the scale of ψ: from weights that see every constraint to those that see only the worst."""
+"""Values of ν times the scale of ψ. Small ones give weight to every constraint, large ones only to the worst."""
 LARGE = 200_000
-"""Beyond so many coordinates a team is certified by the part of it that lies about its worst constraint: …"""
+"""Above this many coordinates only a part of the team around its worst constraint is certified; see `_about_the_worst`."""
 STEPS = 8
-"""… so many constraints away, …"""
+"""Largest distance of the agents of that part from the worst constraint, counted in constraints."""
 MOST_TAKEN = 2000
-"""… or when there are so many agents."""
+"""The part stops growing when it has more agents than this."""
 BLEND = 1e-3
-"""How much of the softest weights every other rung keeps: underflowed weights leave agents without curvature."""
+"""Fraction of the softest weights mixed into the weights of each rung. Weights that underflow to 0 leave agents without curvature."""
 REFINEMENT = 4.0 ** np.arange(0, 8)
-"""As `RUNGS`, where the climb has gone along."""
+"""As `RUNGS`, for the central ascent `_Proof.climb`."""
 CLIMB = 12
-"""Newton steps at each ν of the refinement, at most."""
+"""Largest number of Newton steps at each ν of the central ascent."""
 DENSE = 60
-"""Up to so many coordinates a dense factorisation is the quicker one."""
+"""Up to this many coordinates a dense factorisation is faster than a sparse one."""
 EPS = float(np.finfo(float).eps)
 ROUNDINGS = 64
-"""Allowance for the roundings within a term of a sum, in units of `EPS` and of the sizes that went into it; the sum adds one a term."""
+"""Allowance for rounding errors within one term of a sum, in units of `EPS` times the size of the term. Each further term adds 1."""
 BINDING = 1e-3
 """A multiplier below this does not count as binding."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Bounds on β̄*, the best margin any formation of the team can have.
+    """Bounds on β̄*, the best margin that any formation of the team can have.
 
     Attributes:
-        lower: β̄ at the formation in hand; +∞ for a team without constraints.
-        upper: proven; None if nothing is.
-        multipliers: (M,) λ that prove `upper`; they sum to 1 within every cluster that has concave constraints.
-        verdict: ``feasible`` if the formation in hand satisfies all, ``infeasible`` if `upper` ≤ 0, else ``undecided``.
-        binding: places of the constraints that λ rests on, the heaviest first.
-        clusters: (C, 2) lower and upper bound of every cluster, +∞ where there are no constraints or nothing is proven.
+        lower: lower bound: β̄ at the given formation. +∞ for a team without constraints.
+        upper: proven upper bound; None if there is none.
+        multipliers: (M,) λ that prove `upper`. They sum to 1 within each cluster for which a bound is proven.
+        verdict: ``feasible`` if the given formation satisfies all constraints, ``infeasible`` if `upper` ≤ 0, else ``undecided``.
+        binding: indices of the constraints with λ above `BINDING`, the largest first.
+        clusters: (C, 2) lower and upper bound of each cluster; +∞ where there are no constraints or nothing is proven.
     """
 
     lower: float
@@ -80,10 +81,10 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
 
     Args:
         team: the team.
-        positions: (N, d) x̂, length.
-        nu: the ν of a run, whose own weights are then tried, too.
-        refine: climb from x̂ centrally to sharpen the upper bound; without, it costs about as much as a dozen evaluations of the team.
-        multipliers: (M,) weights to try, such as those of `consat.certify.optimum.max_min`.
+        positions: (N, d) formation x̂, length.
+        nu: smoothing of a run; its weights at x̂ are tried, too.
+        refine: whether to tighten the upper bound by a central ascent from x̂. Without it, the cost is about a dozen evaluations of a team.
+        multipliers: (M,) further weights to try, such as those of `consat.certify.optimum.max_min`.
     """
     x = np.asarray(positions, dtype=float)
     if not len(team.owner):
@@ -93,7 +94,7 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
     with np.errstate(over="ignore", invalid="ignore"):
         model = expand(team, x) if np.isfinite(x).all() else None
         lower = -np.inf if model is None else float(model.value.min())
-        if model is not None and lower == -np.inf:  # what is proven elsewhere holds all the same
+        if model is not None and lower == -np.inf:  # upper bounds hold for any expansion point
             model = expand(team, middle(team))
         if model is None or not np.isfinite(model.value).all():
             return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
@@ -110,13 +111,13 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
 
 
 def judged(team: Team) -> tuple[Optimum, Certificate]:
-    """The best formation that is found centrally, and what is proven of the team; sharpened where that may not be the best."""
+    """The best formation found by central optimization, and a certificate of the team. Refined if the formation may not be the best."""
     best = max_min(team)
     return best, bounds(team, best.positions, refine=not best.exact, multipliers=best.multipliers)
 
 
 def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Certificate:
-    """Certify a large team by a part of it: what bounds the margin of some of the constraints bounds that of all."""
+    """Certify a large team through a part around its worst constraint: an upper bound for some of the constraints holds for all."""
     values = np.asarray(evaluate(Objective.at_positions(team), on_device(x)))
     if not np.isfinite(values).all():
         return Certificate(-np.inf, None, np.zeros(len(values)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
@@ -144,7 +145,23 @@ def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Cert
 
 
 class _Proof:
-    """The best bound of every cluster so far, and the λ that gives it."""
+    """The best upper bound of each cluster so far, and the λ that prove it.
+
+    Attributes:
+        cluster: (N,) cluster of each agent.
+        group: (M,) cluster of each constraint.
+        count: C, the number of clusters.
+        concave: (M,) whether a constraint is proven concave.
+        exact: whether all concave constraints are quadratic.
+        model: expansion of the concave constraints about x̂.
+        margins: (C,) margin at x̂.
+        psi: (M,) scale of ψ in the cluster of each constraint.
+        radius: (N,) bound on the distance of better formations from x̂, length.
+        rounding: (M,) relative allowance for rounding errors in values.
+        roughness: (N,) relative allowance for rounding errors in gradients.
+        upper: (C,) best upper bound so far.
+        best: (M,) λ that prove it.
+    """
 
     def __init__(self, team: Team, model: Expansion) -> None:
         shape, self.cluster = shape_of(team), clusters(team)
@@ -169,14 +186,14 @@ class _Proof:
         self.best = np.zeros(len(self.group))
 
     def weights(self, values: Floats, nu: Floats | float) -> Floats:
-        """Softmax weights of the concave constraints within each cluster."""
+        """(M,) softmax weights of the concave constraints within each cluster."""
         exponent = np.where(self.concave & np.isfinite(values), -nu * values, -np.inf)
         top = np.full(self.count, -np.inf)
         np.maximum.at(top, self.group, exponent)
         return normalised(np.exp(exponent - np.where(np.isfinite(top), top, 0.0)[self.group]), self.group, self.count)
 
     def ladder(self, nu: Nu | None, multipliers: Floats | None) -> None:
-        """Weights at x̂ itself."""
+        """Try weights at x̂: softmax weights over `RUNGS`, those of a run with smoothing `nu`, and given `multipliers`."""
         soft = self.weights(self.model.value, 1.0 / self.psi)
         candidates = [(1 - BLEND) * self.weights(self.model.value, rung / self.psi) + BLEND * soft for rung in RUNGS]
         if nu is not None:
@@ -188,7 +205,7 @@ class _Proof:
             self.consider(self.model, weights)
 
     def climb(self) -> None:
-        """Weights at maximisers of β over a rising ν, by Newton's method from x̂ on."""
+        """Try weights at maximisers of β for increasing ν, found by Newton's method from x̂ or, where β is larger, from `middle`."""
         model = self.model
         central = expand(self.team, middle(self.team)).keep(self.concave)
         soft = 1.0 / self.psi
@@ -208,7 +225,7 @@ class _Proof:
             self.consider(model, self.weights(model.value, nu))
 
     def newton(self, model: Expansion, weights: Floats, nu: Floats) -> tuple[Floats, Floats]:
-        """The step for β, and its slope along it in each cluster; 0 where there is nothing left to gain."""
+        """(N, d) Newton step for β, and (C,) slope of β along it in each cluster; 0 where no gain is left."""
         slope = model.gradient(weights)
         jacobian = model.jacobian()
         bend = -model.hessian(weights) + (jacobian.T @ (sparse.diags_array(nu * weights) @ jacobian))
@@ -219,7 +236,7 @@ class _Proof:
         return step, np.where(promise > 1e-14 * psi, promise, 0.0)
 
     def line_search(self, model: Expansion, step: Floats, promise: Floats, rung: float) -> tuple[Expansion, bool]:
-        """Halve the step of each cluster until β rises."""
+        """Halve the step of each cluster until β increases enough. Returns the new expansion and whether any cluster moved."""
         nu, length = rung / self.psi, np.where(promise > 0, 1.0, 0.0)
         before = self.smooth(model.value, nu)
         for _ in range(30):
@@ -242,7 +259,7 @@ class _Proof:
         return np.where(total > 0, low - np.log(np.where(total > 0, total, 1.0)) / sharp, low)
 
     def consider(self, model: Expansion, weights: Floats) -> None:
-        """Take, in each cluster, what λ proves if that is better than what is proven."""
+        """Update the bound of each cluster with the one that λ proves, at z = the expansion point and at the maximisers of q."""
         self.settle(model, np.zeros(model.at.shape), weights)
         bend, slope = -model.hessian(weights), model.gradient(weights)
         damping = 1e-14
@@ -251,10 +268,10 @@ class _Proof:
             self.settle(model, step, weights)
             if not (np.linalg.norm(step, axis=1) > 10 * self.radius).any():
                 break
-            damping *= 1e4  # a direction without curvature: go no farther than a better formation can lie
+            damping *= 1e4  # almost no curvature in some direction: damp the step, better formations are within `radius`
 
     def settle(self, model: Expansion, step: Floats, weights: Floats) -> None:
-        """The bound that λ gives with z = model.at + step."""
+        """Update the bound of each cluster with the one that λ proves for z = model.at + step."""
         if not self.exact and step.any():
             model, step = expand(self.team, model.at + step).keep(self.concave), np.zeros_like(step)
         values, slope = model.values(step), model.gradient(weights, step)
@@ -266,7 +283,9 @@ class _Proof:
         bound = np.bincount(self.group, np.where(weights > 0, terms, 0.0), minlength=self.count)
         bound += np.bincount(self.cluster, reach, minlength=self.count)
         total = np.bincount(self.group, weights, minlength=self.count)
-        unknown = np.bincount(self.group, (weights > 0) & ~model.known, minlength=self.count) > 0  # no tangent, no bound
+        unknown = (
+            np.bincount(self.group, (weights > 0) & ~model.known, minlength=self.count) > 0
+        )  # a constraint without an expansion proves nothing
         bound = np.where((total > 0.5) & ~unknown & ~np.isnan(bound), np.maximum(bound, self.margins), np.inf)
         better = bound < self.upper
         self.upper = np.where(better, bound, self.upper)
@@ -274,7 +293,7 @@ class _Proof:
 
 
 def _sizes(model: Expansion, step: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """(M,) the sizes of the terms summed into each ψ and (N,) those summed into Σ λ∇ψ: what roundings are relative to."""
+    """(M,) sums of the absolute terms of each ψ, and (N,) of Σ λ∇ψ. Rounding errors are relative to these."""
     size, rough = np.abs(model.value), np.zeros(model.size)
     far, flat = np.abs(model.at).ravel(), np.abs(step).ravel()
     for block in model.blocks:
@@ -286,7 +305,7 @@ def _sizes(model: Expansion, step: Floats, weights: Floats) -> tuple[Floats, Flo
 
 
 def _solve(bend: sparse.csc_array, slope: Floats, damping: float) -> Floats:
-    """(bend + δ)⁻¹ slope, δ relative to the largest entry."""
+    """(bend + δI)⁻¹ slope, with δ = damping times the largest diagonal entry; 0 where the result is not finite."""
     diagonal = bend.diagonal()
     largest = float(diagonal.max(initial=0.0))
     if not largest > 0:

@@ -2,8 +2,8 @@
 
     maximise Σ_c t_c   subject to   c_k + b_k·y + ½ yᵀH_k y ≥ t_c for each constraint k of cluster c,   ‖y_i‖ ≤ Δ_i
 
-With −H = FᵀF a constraint is the second-order cone ‖(√2 F y, w − 1)‖ ≤ w + 1, w = c + b·y − t. The clusters share no variable, so one
-program maximises every one of them. Each is brought to its own units first, whether it was written in millimetres or in kilometres.
+With −H = FᵀF a constraint is the second-order cone ‖(√2 F y, w − 1)‖ ≤ w + 1, w = c + b·y − t. Clusters share no variable, so one program
+maximises all of them. Each cluster is scaled to its own units first, so that the unit of length does not matter.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from scipy import sparse
 from consat.certify.quadratics import Block, Expansion, Floats, Ints
 
 FLAT = 1e-12
-"""Eigenvalues below this part of the largest are rounding."""
+"""Eigenvalues below this fraction of the largest count as 0."""
 STRAIGHT = 1e-6
-"""A curvature below this part of the largest says nothing of the size of ψ."""
+"""Eigenvalues below this fraction of the largest are ignored when the scale of ψ is estimated."""
 TOLERANCE = 1e-9
-"""Clarabel's relative gap and residuals, in units of a cluster's own scale; 1e-8 is its default, 1e-10 is out of reach at times."""
+"""Clarabel's tolerance for gap and residuals, in the units of a cluster. Its default is 1e-8; 1e-10 is not always reached."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What the solver found.
+    """The result of the solver.
 
     Attributes:
-        step: (N, d) y, zero for agents that no constraint reads.
-        multipliers: (M,) λ, sum to 1 within each cluster that has constraints.
+        step: (N, d) y, length; 0 for agents that no constraint reads.
+        multipliers: (M,) λ, which sum to 1 within each cluster that has constraints.
         status: "solved", "unbounded" (the margin has no upper limit) or "failed".
     """
 
@@ -42,19 +42,21 @@ class Solution:
 
 @dataclass(frozen=True)
 class Units:
-    """The units (C,) of length and ψ in each cluster."""
+    """(C,) units of length and of ψ for each cluster."""
 
     length: Floats
     psi: Floats
 
 
 def units(model: Expansion, group: Ints, count: int) -> Units:
-    """Typical sizes in each cluster: the value and the radius of a curved ψ about its top, the slope of a flat one over that length.
+    """Typical sizes of length and ψ in each cluster.
+
+    For a curved ψ: its value at the stationary point, and the corresponding radius. For an affine ψ: its slope times that length.
 
     Args:
-        model: with concave Hessians.
-        group: (M,) the cluster of each constraint.
-        count: C.
+        model: expansion with negative semidefinite Hessians.
+        group: (M,) cluster of each constraint.
+        count: C, the number of clusters.
     """
     top, bend, slope = (np.zeros(len(group)) for _ in range(3))
     for block in model.blocks:
@@ -73,21 +75,21 @@ def units(model: Expansion, group: Ints, count: int) -> Units:
 
 
 def _typical(sizes: Floats, counted: np.ndarray, group: Ints, count: int, default: Floats) -> Floats:
-    """The geometric mean in each group."""
+    """(C,) geometric mean, in each group, of the sizes that are `counted`; `default` where there are none."""
     number = np.bincount(group[counted], minlength=count)
     logs = np.bincount(group[counted], np.log(sizes[counted]), minlength=count)
     return np.where(number > 0, np.exp(logs / np.maximum(number, 1)), default)
 
 
 def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None = None, ceiling: Floats | None = None) -> Solution:
-    """Maximise the smallest ψ of every cluster.
+    """Maximise the smallest ψ of each cluster.
 
     Args:
-        model: with concave Hessians.
-        cluster: (N,) the cluster of each agent.
-        group: (M,) the cluster of each constraint.
-        trust: (N,) how far each agent may move, length; None: as far as it likes.
-        ceiling: (C,) the margin need not exceed this many units of ψ of its cluster; None: no limit.
+        model: expansion with negative semidefinite Hessians.
+        cluster: (N,) cluster of each agent.
+        group: (M,) cluster of each constraint.
+        trust: (N,) radius of the trust region of each agent, length; None: no limit.
+        ceiling: (C,) upper limit of the margin of each cluster, in its units of ψ; None: no limit.
     """
     import cvxpy as cp
 
@@ -127,7 +129,13 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
 
 
 def _cone(slack: Any, flat: Any, members: int) -> Any:
-    """w ≥ ½ ‖F y‖² for every member, `flat` being √2 F y member by member, or None where there is no curvature."""
+    """The constraint w ≥ ½ ‖F y‖² for each member.
+
+    Args:
+        slack: (members,) w.
+        flat: √2 F y, concatenated over the members; None if they have no curvature.
+        members: number of members.
+    """
     import cvxpy as cp
 
     if flat is None:
@@ -141,7 +149,7 @@ def _solve(problem: Any) -> str:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it may be inaccurate: whoever uses the answer evaluates it
+            warnings.simplefilter("ignore")  # about inaccurate solutions: callers evaluate the result themselves
             problem.solve(solver=cp.CLARABEL, tol_gap_abs=TOLERANCE, tol_gap_rel=TOLERANCE, tol_feas=TOLERANCE)
     except cp.SolverError:
         return "failed"
@@ -151,14 +159,20 @@ def _solve(problem: Any) -> str:
 
 
 def normalised(weights: Floats, group: Ints, count: int) -> Floats:
-    """Weights ≥ 0 that sum to 1 within each group; those of a group without any stay 0."""
+    """Weights clipped at 0 and scaled to sum to 1 within each group. Groups without positive weights stay at 0.
+
+    Args:
+        weights: (M,).
+        group: (M,) group of each weight.
+        count: number of groups.
+    """
     weights = np.maximum(weights, 0.0)
     total = np.bincount(group, weights, minlength=count)
     return weights / np.where(total > 0, total, 1.0)[group]
 
 
 def _multiplier(constraint: Any) -> Floats:
-    """The dual of w ≥ …: w stands in both ends of the cone, w + 1 and w − 1."""
+    """(members,) dual of w ≥ …. In a cone, w appears in the head (w + 1) and in the last row (w − 1), so both duals are added."""
     dual = constraint.dual_value
     if isinstance(dual, list):
         head, tail = np.atleast_1d(dual[0]), np.atleast_2d(dual[1])
@@ -168,13 +182,19 @@ def _multiplier(constraint: Any) -> Floats:
 
 
 def _rows(entries: Floats, columns: Ints, size: int) -> sparse.csr_array:
-    """A sparse matrix with as many entries in every row."""
+    """A sparse matrix with the same number of entries in each row.
+
+    Args:
+        entries: (rows, width).
+        columns: (rows, width) column of each entry.
+        size: number of columns of the matrix.
+    """
     rows, width = entries.shape
     return sparse.csr_array((entries.ravel(), columns.ravel(), np.arange(rows + 1) * width), shape=(rows, size))
 
 
 def _by_rank(block: Block) -> list[tuple[Ints, Floats, Floats, Ints]]:
-    """The members by the rank of −H = FᵀF: their numbers, F (m, rank, n), b and columns."""
+    """The members of a block, split by the rank of −H = FᵀF: for each rank their numbers, F (m, rank, n), b and columns."""
     eigenvalues, vectors = np.linalg.eigh(-block.hessian)
     curved = eigenvalues > FLAT * np.abs(eigenvalues).max(axis=1, keepdims=True)
     ranks, n = curved.sum(axis=1), block.columns.shape[1]

@@ -1,8 +1,8 @@
-"""How far a better formation can lie: radii that turn a leftover gradient into a bound (design, section 6).
+"""Bounds on the distance between a formation and any better one. A certificate needs them to turn a remaining gradient into a bound.
 
-Whoever is better than x̂ satisfies ψ_k ≥ L = β̄(x̂) for every k. Constraints on one agent then keep it in a region of its own; constraints
-on the difference of two keep them within reach of each other; so the radius of an agent is a shortest path from the regions along the
-reaches. Affine constraints and supporting planes of concave ones are gathered into polytopes.
+A formation better than x̂ satisfies ψ_k ≥ L = β̄(x̂) for all k. Then constraints on one agent confine it to a region, and constraints on the
+difference of two agents limit the change of that difference. The radius of an agent is the shortest path, along these limits, from an agent
+with a region. Affine constraints and supporting planes of concave ones are collected into polytopes.
 """
 
 from __future__ import annotations
@@ -18,17 +18,23 @@ from consat.certify.quadratics import Block, Expansion, Floats, Ints, tangents
 from consat.problem.team import Team
 
 MOST_POLYTOPES = 2000
-"""So many slanted polytopes are measured, each by a few small non-negative least squares; agents beyond count as unlimited."""
+"""Largest number of polytopes with slanted planes that are measured, each by a few small non-negative least squares."""
 MOST_DENSE = 600
-"""Up to so many coordinates an ellipsoid around the whole team is tried, by dense eigenvalues."""
+"""Up to this many coordinates an ellipsoid around each cluster is tried, by dense eigenvalues."""
 TANGENTS = (1.0, 10.0, 100.0)
-"""How far from x̂ tangent planes are laid, in lengths of the team."""
+"""Distances from x̂ at which tangent planes are computed, in lengths of the team."""
 FLAT = 1e-12
-"""A curvature or a slope below this part of its constraint's largest is rounding."""
+"""A curvature or slope below this fraction of the largest of its constraint counts as 0."""
 
 
 class _Planes(NamedTuple):
-    """normal·v + height ≥ 0, v the position of an agent (pair (i, i)) or a difference y_i − y_j (pair (i, j)), about x̂."""
+    """Half-spaces normal·v + height ≥ 0, relative to x̂: v is the position of an agent (pair (i, i)) or y_i − y_j (pair (i, j)).
+
+    Attributes:
+        pair: (P, 2) agents.
+        normal: (P, d).
+        height: (P,).
+    """
 
     pair: Ints
     normal: Floats
@@ -36,21 +42,26 @@ class _Planes(NamedTuple):
 
 
 class _Reaches(NamedTuple):
-    """‖v‖ ≤ reach for pairs as above."""
+    """Balls ‖v‖ ≤ reach, with v as in `_Planes`.
+
+    Attributes:
+        pair: (P, 2) agents.
+        reach: (P,) length.
+    """
 
     pair: Ints
     reach: Floats
 
 
 def radii(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
-    """(N,) R with ‖x_i − x̂_i‖ ≤ R_i for every formation x whose kept constraints are all at least `lower`; ∞ where nothing proves it.
+    """(N,) R with ‖x_i − x̂_i‖ ≤ R_i for each formation x whose constraints in `model` are all at least `lower`; ∞ if none is proven.
 
-    Formations that differ by a translation of a whole cluster which none of its kept constraints notices count as one.
+    Formations that differ by a translation of a whole cluster count as one if no constraint of the cluster depends on the translation.
 
     Args:
-        model: concave quadratics about x̂ = `model.at`, and planes above other concave constraints (`with_tangents`).
-        lower: (M,) the margin that counts as better, for the cluster of each constraint.
-        cluster: (N,) the cluster of each agent.
+        model: concave quadratics about x̂ = `model.at`, and tangent planes of other concave constraints (`with_tangents`).
+        lower: (M,) margin to exceed, of the cluster of each constraint.
+        cluster: (N,) cluster of each agent.
     """
     count, dimension = model.at.shape
     reaches: list[_Reaches] = []
@@ -72,7 +83,7 @@ def radii(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
 
 
 def _anchors(model: Expansion, cluster: Ints) -> _Planes:
-    """Where a translation v of a whole cluster leaves every ψ as it is, one of its agents may be held: ±v·y_i ≥ 0."""
+    """Planes ±v·y_i ≥ 0 that fix one agent of each cluster in the directions v in which translating the cluster changes no ψ."""
     count, dimension = model.at.shape
     notice = np.zeros((int(cluster.max(initial=-1)) + 1, dimension, dimension))
     walled = np.zeros(count, dtype=bool)
@@ -93,13 +104,24 @@ def _anchors(model: Expansion, cluster: Ints) -> _Planes:
     c, k = np.nonzero(size <= FLAT**2 * np.maximum(size[:, -1:], 1.0))
     agents, normals = np.repeat(first[c], 2), np.repeat(vectors[c, :, k], 2, axis=0)
     normals[1::2] *= -1
-    if len(c) == dimension * len(np.unique(c)):  # all directions: let the planes be upright, which is cheaper
+    if len(c) == dimension * len(np.unique(c)):  # all directions: axis-parallel planes are cheaper to measure
         normals = np.tile(np.repeat(np.eye(dimension), 2, axis=0) * np.tile([[1.0], [-1.0]], (dimension, 1)), (len(np.unique(c)), 1))
     return _Planes(np.stack([agents, agents], axis=1), normals, np.zeros(len(agents)))
 
 
 def with_tangents(team: Team, model: Expansion, lower: Floats, curved: NDArray[np.bool_], length: float) -> tuple[Expansion, Floats]:
-    """`model` and `lower` for `radii`, with concave constraints beyond degree 2 (M,) `curved` replaced by tangent planes around x̂."""
+    """Arguments for `radii`, with concave constraints that are not quadratic replaced by tangent planes around x̂.
+
+    Args:
+        team: the team.
+        model: expansion about x̂.
+        lower: (M,) margin to exceed, of the cluster of each constraint.
+        curved: (M,) which constraints to replace.
+        length: natural length of the team.
+
+    Returns:
+        the expansion and `lower` with one more entry for each plane.
+    """
     dimension, blocks = model.at.shape[1], list(model.keep(~curved).blocks)
     values, lowers, size = [model.value], [lower], len(model.value)
     shifts = [sign * far * length * axis for far in TANGENTS for axis in np.eye(dimension) for sign in (1.0, -1.0)]
@@ -123,7 +145,7 @@ def with_tangents(team: Team, model: Expansion, lower: Floats, curved: NDArray[n
 
 
 def _of_differences(block: Block, dimension: int) -> NDArray[np.bool_]:
-    """Members of two agents that read nothing but their difference."""
+    """(m,) whether a member depends only on the difference of the positions of two agents."""
     if block.columns.shape[1] != 2 * dimension:
         return np.zeros(len(block.number), dtype=bool)
     near, far = block.gradient[:, :dimension], block.gradient[:, dimension:]
@@ -133,7 +155,7 @@ def _of_differences(block: Block, dimension: int) -> NDArray[np.bool_]:
 
 
 def _balls(block: Block, slack: Floats, balanced: NDArray[np.bool_], dimension: int) -> list[_Reaches]:
-    """Where a strictly concave quadratic is at least L: ‖v − v₀‖ ≤ √(2 (top − L) / μ)."""
+    """Balls that contain the points where a strictly concave quadratic is at least L: ‖v − v₀‖ ≤ √(2 (top − L) / μ)."""
     parts = []
     for members, width in ((balanced, dimension), (~balanced, block.columns.shape[1])):
         if not members.any():
@@ -151,7 +173,7 @@ def _balls(block: Block, slack: Floats, balanced: NDArray[np.bool_], dimension: 
 
 
 def _planes(block: Block, slack: Floats, balanced: NDArray[np.bool_], dimension: int) -> list[_Planes]:
-    """Members on one agent or a difference as planes; a concave ψ lies below its tangent plane, whatever its curvature."""
+    """Tangent planes at x̂ of the members that depend on one agent or one difference. A concave ψ lies below its tangent plane."""
     known = balanced if block.columns.shape[1] != dimension else np.ones(len(block.number), dtype=bool)
     if not known.any() or block.columns.shape[1] > 2 * dimension:
         return []
@@ -166,7 +188,10 @@ def _joined(planes: list[_Planes]) -> _Planes:
 
 
 def _boxes(planes: _Planes, reaches: list[_Reaches], count: int) -> _Reaches:
-    """The polytopes of one agent or one difference: by their axis-parallel planes, else by Farkas' lemma, where no ball holds them yet."""
+    """Balls around the polytopes of one agent or one difference.
+
+    Axis-parallel planes give a box. Otherwise, if there is no ball in `reaches` yet, `_farkas` measures the polytope.
+    """
     key = planes.pair[:, 0] * count + planes.pair[:, 1]
     keys, place = np.unique(key, return_inverse=True)
     sizes = np.linalg.norm(planes.normal, axis=1)
@@ -190,7 +215,10 @@ def _boxes(planes: _Planes, reaches: list[_Reaches], count: int) -> _Reaches:
 
 
 def _together(walls: _Planes, pair: Ints, reach: Floats, paths: Floats) -> Floats:
-    """Agents within reach of each other share their walls: a wall of one is a wall of another, farther off by the reach between them."""
+    """Radii of agents that are connected by reaches and share their planes.
+
+    A plane of one agent is a plane of a connected agent, farther away by the reach between them. Used where `paths` is infinite.
+    """
     count = len(paths)
     tied = pair[:, 0] != pair[:, 1]
     graph = _graph(pair[tied], reach[tied], count)
@@ -211,8 +239,8 @@ def _together(walls: _Planes, pair: Ints, reach: Floats, paths: Floats) -> Float
 
 
 def _farkas(normal: Floats, height: Floats) -> float:
-    """A radius of {v: normal v + height ≥ 0} about 0: μ ≥ 0 with Σ μ normal = −e gives e·v ≤ μ·height."""
-    from scipy.optimize import nnls  # a tenth of a second, which most teams can do without
+    """A radius of {v: normal v + height ≥ 0} about 0, by Farkas' lemma: μ ≥ 0 with Σ μ normal = −e gives e·v ≤ μ·height."""
+    from scipy.optimize import nnls  # the import takes a tenth of a second, and most teams do not need it
 
     sizes = np.linalg.norm(normal, axis=1)
     normal, height = normal[sizes > 0] / sizes[sizes > 0, None], height[sizes > 0] / sizes[sizes > 0]
@@ -229,14 +257,14 @@ def _farkas(normal: Floats, height: Floats) -> float:
 
 
 def _paths(pair: Ints, reach: Floats, count: int) -> Floats:
-    """Shortest paths from a source that is joined to every agent with a region of its own."""
+    """(N,) shortest paths from a virtual source, which is linked to each agent that has a region."""
     own = pair[:, 0] == pair[:, 1]
     distances: Floats = dijkstra(_graph(np.stack([np.where(own, count, pair[:, 0]), pair[:, 1]], axis=1), reach, count + 1), indices=count)
     return distances[:count]
 
 
 def _graph(pair: Ints, reach: Floats, count: int) -> sparse.csr_array:
-    """The shortest of the reaches between every two, both ways."""
+    """Symmetric graph of the reaches: between two agents the shortest one."""
     tail, head = pair[:, 0], pair[:, 1]
     tail, head, reach = np.concatenate([tail, head]), np.concatenate([head, tail]), np.concatenate([reach, reach])
     order = np.lexsort((reach, head, tail))
@@ -247,7 +275,11 @@ def _graph(pair: Ints, reach: Floats, count: int) -> sparse.csr_array:
 
 
 def _ellipsoid(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
-    """The mean of all constraints is at least L, too: where it is strictly concave, that is an ellipsoid."""
+    """(N,) radii from a weighted sum of the constraints of each cluster; ∞ where this proves nothing.
+
+    At a better formation each ψ_k is at least L, so the sum is at least L times the sum of the weights. If the sum is strictly concave,
+    such formations lie in an ellipsoid.
+    """
     weights, gap = np.zeros(len(model.value)), np.zeros(len(model.value))
     for block in model.blocks:
         norm = np.linalg.norm(block.hessian, axis=(1, 2))

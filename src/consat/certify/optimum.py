@@ -1,14 +1,14 @@
-"""The centralised optimum: the best margin any formation can have, and a formation that has it.
+"""The centralised optimum: the best margin that any formation can have, and a formation with this margin.
 
     β̄* = max_x min_k ψ_k(x)
 
-Clusters are independent, so each is maximised for itself, and β̄* is the worst of them.
+Clusters are independent. Each is maximised separately, and β̄* is the smallest of their margins.
 
 * All ψ concave of degree ≤ 2: one cone program (`conic`), exact.
-* Otherwise starts climb β by ν-continuation (`ascent`), and the best is polished: ψ_k is replaced by its value, gradient and the
-  concave part of its Hessian, and that cone program is solved within a trust region, again and again. Where ψ is a quadratic the
-  replacement lies below it, so that steps only ever gain (the convex–concave procedure: Lipp, Boyd 2016); where ψ is concave it is exact
-  to second order, so that they converge superlinearly.
+* Otherwise gradient ascent with increasing ν from many starts (`ascent`), then polishing of the best: ψ_k is replaced by its value, its
+  gradient and the concave part of its Hessian, and the cone program is solved within a trust region, repeatedly. If ψ is a quadratic, the
+  replacement is a lower bound, so each step increases the margin (convex–concave procedure: Lipp, Boyd 2016). If ψ is concave, the
+  replacement is exact to second order, so the steps converge superlinearly.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from consat.problem.team import Team
 from consat.problem.units import scale
 
 STARTS = 32
-"""Starts for a team that is not concave."""
+"""Number of starts for a team that is not concave."""
 POLISHED = 3
-"""How many of the best starts of each cluster are polished."""
+"""Number of the best starts of each cluster that are polished."""
 MOST_VALUES = 4_000_000
-"""Starts are so many that no more than this many ψ are held at once."""
+"""Limit on (number of starts) × (number of constraints), for memory. Large teams get fewer starts."""
 ROUNDS = 60
-"""Cone programs at most in polishing one start."""
+"""Largest number of cone programs for polishing one start."""
 SETTLED = 1e-9
-"""Polishing ends when a step promises less than this, in units of ψ; the cone programs resolve no more."""
+"""Polishing stops when the predicted gain of a step is below this, in units of ψ. The cone programs are not more accurate."""
 AGAIN = 3
-"""Steps of the exact solution at most."""
+"""Largest number of steps of the exact solution."""
 FAR = 1e3
-"""A step longer than this, in lengths, is taken up again from where it ended: digits were lost."""
+"""After a step longer than this, in natural lengths, the program is solved again at the new point, because digits were lost."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Optimum:
     Attributes:
         positions: (N, d), length.
         margin: β̄ at `positions`; +∞ for a team without constraints.
-        multipliers: (M,) how much each constraint binds; they sum to 1 within every cluster.
-        method: how it was found, and how far to trust it, in words.
-        exact: whether `margin` is the best possible (up to the solver's tolerance).
-        unbounded: whether the margin can be made as large as one likes; `positions` is then one formation of many.
+        multipliers: (M,) multiplier of each constraint, large where it binds. They sum to 1 within each cluster that has constraints.
+        method: how the formation was found, and whether it is exact, in words.
+        exact: whether `margin` is the best possible, up to the tolerance of the solver.
+        unbounded: whether the margin has no upper limit; `positions` is then one formation of many.
     """
 
     positions: Floats
@@ -69,8 +69,8 @@ def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
 
     Args:
         team: the team.
-        starts: how many starts, for a team that is not concave quadratic.
-        seed: of the starts.
+        starts: number of starts for a team that is not concave quadratic. If None, 4 for a concave team, else `STARTS`.
+        seed: seed of the random starts.
     """
     shape, cluster = shape_of(team), clusters(team)
     first = middle(team)
@@ -82,19 +82,21 @@ def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
 
 
 def cluster_margins(team: Team, values: Floats, cluster: Ints) -> Floats:
-    """(C,) the smallest of the (M,) ψ in each cluster, +∞ where there is none."""
+    """(C,) smallest of the (M,) ψ in each cluster; +∞ for a cluster without constraints."""
     margins = np.full(int(cluster.max(initial=-1)) + 1, np.inf)
     np.minimum.at(margins, cluster[team.owner], values)
     return margins
 
 
 def middle(team: Team) -> Floats:
-    """(N, d) where Σ ψ, over the concave quadratics, is largest: near enough to the optimum to compute from. Agents that this leaves
-    open are at their start, or at the centre of the team."""
+    """(N, d) maximiser of a weighted sum of the concave quadratic ψ, length: an expansion point near the optimum.
+
+    Agents that the sum does not determine are at their start or, without one, at the centre of the team.
+    """
     shape, size = shape_of(team), scale(team)
     x = np.where(np.isnan(team.starts), size.center, team.starts)
     usable = shape.quadratic & shape.concave
-    for _ in range(2):  # the second pass makes up for digits lost where the first began far away
+    for _ in range(2):  # the second pass recovers digits lost if the first began far away
         model = expand(team, x).keep(usable)
         weights = _inverse_bend(model)
         bend = -model.hessian(weights)
@@ -135,7 +137,7 @@ def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
 
 
 def _limitless(team: Team, cluster: Ints, model: Expansion) -> Optimum:
-    """Some clusters have no best margin: these stop at one that is ample, at least as good as that of the others."""
+    """The optimum if the margin of some clusters has no upper limit. These stop at a margin at least as large as that of the others."""
     group = cluster[team.owner]
     count = int(cluster.max()) + 1
     unit, has = units(model, group, count), np.bincount(group, minlength=count) > 0
@@ -197,7 +199,7 @@ def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: 
 
 
 def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools]:
-    """A local max-min from x: positions, multipliers, and (C,) whether it settled."""
+    """A local max-min, starting from x: (N, d) positions, (M,) multipliers, and (C,) whether the iteration converged."""
     group = cluster[team.owner]
     model = concave_part(expand(team, x))
     unit = units(model, group, int(cluster.max()) + 1)
@@ -225,7 +227,7 @@ def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools
 
 
 def concave_part(model: Expansion) -> Expansion:
-    """The same with the positive eigenvalues of every Hessian left out."""
+    """The expansion with the positive eigenvalues of each Hessian set to 0."""
     blocks = []
     for block in model.blocks:
         eigenvalues, vectors = np.linalg.eigh(block.hessian)

@@ -1,10 +1,10 @@
-"""Constraints to second order about a formation, as arrays: what the exact tests, the reference and the certificate compute with.
+"""Second-order expansions of the constraints about a formation, as arrays. The exact tests, the optimum and the certificate use them.
 
     ψ_k(x₀ + y) = c_k + b_k·y + ½ yᵀH_k y,    c_k = ψ_k(x₀),  b_k = ∇ψ_k(x₀)
 
-is exact for constraints of degree ≤ 2. A ψ that is −∞ there, or has no slope that can be computed with, is left out (see
-`consat.problem.constraints.domain`). It is taken about a formation near the answer rather than about the origin, where the
-coefficients of a team far out (a disc of radius 1 at 1e6) would have lost their digits.
+The expansion is exact for constraints of degree ≤ 2. A ψ that is −∞ at x₀, or has no finite gradient, is left out; see
+`consat.problem.constraints.domain`. The expansion point is a formation near the solution. About the origin, the coefficients of a team far
+away (a disc of radius 1 at 1e6) would lose their digits.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Shape:
-    """What is proven of each constraint of a team.
+    """Proven properties of the constraints of a team.
 
     Attributes:
         curvature: (M,) of `Curvature`, in all positions jointly.
-        strict_in_own: (M,) whether strictly concave in the owner's position, the others held.
-        quadratic: (M,) whether a polynomial of degree ≤ 2.
-        concave: (M,) whether proven concave in all positions jointly.
-        hessians: for each family (M_f, n, n) constant weighted Hessians, n = arity·d, or None beyond degree 2.
+        strict_in_own: (M,) whether ψ is strictly concave in the owner's position, with the others fixed.
+        quadratic: (M,) whether ψ is a polynomial of degree ≤ 2.
+        concave: (M,) whether ψ is concave in all positions jointly.
+        hessians: for each family the (M_f, n, n) constant weighted Hessians, n = arity·d; None if its degree is above 2 or unknown.
     """
 
     curvature: NDArray[np.object_]
@@ -53,7 +53,7 @@ class Shape:
 
 @functools.lru_cache(maxsize=16)
 def shape_of(team: Team) -> Shape:
-    """Read the curvature of every constraint of a team; a team is read once."""
+    """The proven curvature of all constraints of a team. Cached by team."""
     count = len(team.owner)
     curvature = np.full(count, Curvature.UNKNOWN, dtype=object)
     strict, quadratic, concave = np.zeros((3, count), dtype=bool)
@@ -79,11 +79,11 @@ def _hessians(family: Family, dimension: int) -> Floats:
 
 @dataclass(frozen=True)
 class Block:
-    """Members of one family, on their own coordinates y_local = y.ravel()[columns].
+    """Expansions of m constraints of one family, each in its own coordinates y_local = y.ravel()[columns].
 
     Attributes:
-        number: (m,) their places in the team's order of constraints.
-        columns: (m, n) coordinates they read, n = arity·d; coordinate d·i + k is axis k of agent i.
+        number: (m,) indices of the constraints in the team's order.
+        columns: (m, n) coordinates that each reads, n = arity·d; coordinate d·i + k is axis k of agent i.
         gradient: (m, n) b.
         hessian: (m, n, n) H; read-only.
     """
@@ -94,7 +94,7 @@ class Block:
     hessian: Floats
 
     def take(self, members: Bools) -> Block:
-        """Some of the members."""
+        """The block of a subset of the constraints, given by an (m,) mask."""
         if members.all():
             return self
         return Block(self.number[members], self.columns[members], self.gradient[members], self.hessian[members])
@@ -102,12 +102,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Expansion:
-    """All constraints of a team to second order about a formation.
+    """Second-order expansion of the constraints of a team about a formation.
 
     Attributes:
-        at: (N, d) the formation x₀, length.
-        value: (M,) c, in the team's order; −∞ where ψ is no finite number.
-        blocks: family by family, of those that have an expansion.
+        at: (N, d) formation x₀, length.
+        value: (M,) c, in the team's order; −∞ where ψ is not a finite number.
+        blocks: one block per family, with the constraints that have an expansion.
     """
 
     at: Floats
@@ -120,20 +120,20 @@ class Expansion:
         return self.at.size
 
     def keep(self, constraints: Bools) -> Expansion:
-        """Only the constraints (M,) asked for; the others keep their places and have no effect."""
+        """The expansion with only the constraints of an (M,) mask in its blocks. The others keep their entry in `value`."""
         blocks = (block.take(constraints[block.number]) for block in self.blocks)
         return Expansion(self.at, self.value, tuple(block for block in blocks if len(block.number)))
 
     @property
     def known(self) -> Bools:
-        """(M,) which constraints it holds an expansion of."""
+        """(M,) which constraints have an expansion."""
         found = np.zeros(len(self.value), dtype=bool)
         for block in self.blocks:
             found[block.number] = True
         return found
 
     def values(self, y: Floats) -> Floats:
-        """(M,) of the expansion at x₀ + y, y of shape (N, d); those left out by `keep` stay at c."""
+        """(M,) values of the expansion at x₀ + y, y of shape (N, d). Constraints without a block have the value c."""
         total, flat = self.value.copy(), y.ravel()
         for block in self.blocks:
             local = flat[block.columns]
@@ -142,7 +142,7 @@ class Expansion:
         return total
 
     def gradient(self, weights: Floats, y: Floats | None = None) -> Floats:
-        """(N, d) gradient of Σ_k weights_k ψ_k at x₀ + y."""
+        """(N, d) gradient of Σ_k weights_k ψ_k at x₀ + y; at x₀ if y is None."""
         total = np.zeros(self.size)
         for block in self.blocks:
             slope = block.gradient
@@ -153,7 +153,7 @@ class Expansion:
         return total.reshape(self.at.shape)
 
     def jacobian(self) -> sparse.csr_array:
-        """(M, N·d) rows b_k."""
+        """(M, N·d) sparse matrix with the rows b_k."""
         shape = (len(self.value), self.size)
         rows = _joined([np.repeat(block.number, block.columns.shape[1]) for block in self.blocks], int)
         columns = _joined([block.columns.ravel() for block in self.blocks], int)
@@ -161,7 +161,7 @@ class Expansion:
         return sparse.csr_array((entries, (rows, columns)), shape=shape)
 
     def hessian(self, weights: Floats) -> sparse.csc_array:
-        """(N·d, N·d) Σ_k weights_k H_k."""
+        """(N·d, N·d) sparse Σ_k weights_k H_k."""
         rows, columns, entries = [], [], []
         for block in self.blocks:
             n = block.columns.shape[1]
@@ -227,8 +227,12 @@ def _columns(team: Team) -> tuple[Ints, ...]:
 
 @float64
 def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
-    """(M,) weighted ψ at (N, d) positions, −∞ where it is no finite number; and for each family (M_f, arity, d) its gradients, NaN where
-    they can't be computed with."""
+    """Values and gradients of all constraints at (N, d) positions.
+
+    Returns:
+        (M,) weighted ψ, −∞ where ψ is not a finite number; and for each family its (M_f, arity, d) gradients, NaN where the value or the
+        gradient is not finite or is beyond `HUGE`.
+    """
     total, gradients = np.zeros(len(team.owner)), []
     for family, (value, gradient) in zip(team.families, _first_order(_on_device(team), on_device(x)), strict=True):
         total[family.number] = np.asarray(value)
@@ -238,14 +242,23 @@ def values_and_gradients(team: Team, x: Floats) -> tuple[Floats, list[Floats]]:
 
 @float64
 def tangents(team: Team, family: int, arguments: Floats) -> tuple[Floats, Floats]:
-    """(M_f,) weighted ψ and (M_f, arity, d) gradients of a family at (M_f, arity, d) arguments of their own; as `values_and_gradients`."""
+    """(M_f,) weighted ψ and (M_f, arity, d) gradients of one family, with separate arguments for each constraint.
+
+    Args:
+        team: the team.
+        family: index of the family.
+        arguments: (M_f, arity, d) positions, length.
+
+    Returns:
+        as `values_and_gradients`.
+    """
     value, gradient = _tangents(_on_device(team)[family], on_device(arguments))
     return np.asarray(value), np.asarray(gradient)
 
 
 @float64
 def expand(team: Team, at: Floats) -> Expansion:
-    """All constraints of a team to second order about the (N, d) formation `at`."""
+    """The second-order expansion of all constraints of a team about the (N, d) formation `at`."""
     at = np.asarray(at, dtype=float)
     value, gradients = values_and_gradients(team, at)
     blocks = []

@@ -1,8 +1,8 @@
-"""Why a team cannot do better, in words: which constraints conflict or bind, and what the least change is that would help.
+"""Explains in sentences what limits the margin of a team: which constraints conflict or bind, and the smallest change that would help.
 
-Multipliers say which constraints fight, and by how much the margin rises as one of them gives way: dβ̄*/dp = λ_k ∂ψ_k/∂p. That is where
-to look, not what is said: a conflict is stated only if the constraints named, on their own, are proven incompatible, and a cure only if the
-team with that change, solved again, satisfies every constraint of the cluster.
+Multipliers show which constraints conflict, and how much the margin increases if one is relaxed: dβ̄*/dp = λ_k ∂ψ_k/∂p. They only guide the
+search. A conflict is stated only if the named constraints alone are proven incompatible. A cure is stated only if the changed team is
+solved again and satisfies all constraints of the cluster.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from consat.problem.graphs import clusters
 from consat.problem.team import Team
 
 NAMED = 6
-"""A conflict of more constraints than this is summed up by its heaviest."""
+"""Largest number of constraints named in a sentence; of more, those with the largest multipliers are named."""
 TRIED = 3
-"""How many of the binding constraints are tried as the one to relax."""
+"""Number of binding constraints that are tried as the one to relax."""
 SOLVES = 12
-"""Solutions at most in looking for the least relaxation of one constraint."""
+"""Largest number of solutions in each of the two searches (a sufficient relaxation, then the smallest) for one constraint."""
 MOST_SOLVED = 2000
-"""Above this many constraints in a cluster no cure is looked for: each try is a solution of its own."""
+"""Above this many constraints in a cluster no cure is searched, because each trial solves the cluster again."""
 LEAST = 1e-6
-"""No relaxation is proposed below this part of the number relaxed."""
+"""Smallest relaxation to propose, relative to the number that is relaxed."""
 DIGITS = 2
-"""A proposed change is rounded up to so many significant digits."""
+"""Number of significant digits to which a proposed change is rounded up."""
 
 
 @dataclass(frozen=True)
 class _Knob:
-    """One number of one constraint, and the way it must turn to relax it.
+    """One number of one constraint that can be changed to relax it.
 
     Attributes:
-        constraint: its place in the team's order.
-        parameter: of its family; "" stands for the value of ψ itself.
-        entry: index into that parameter.
-        now: its value.
-        gain: dβ̄*/d(turn), > 0.
-        sign: +1 or −1.
+        constraint: index of the constraint in the team's order.
+        parameter: name of the parameter; "" stands for the value of ψ itself.
+        entry: index of the number within the parameter.
+        now: current value of the number.
+        gain: increase of β̄* per unit of relaxation, > 0.
+        sign: +1 if the number must increase to relax the constraint, −1 if it must decrease.
     """
 
     constraint: int
@@ -62,11 +62,11 @@ class _Knob:
 
 
 def explain(team: Team, optimum: Optimum) -> list[str]:
-    """Sentences about what limits a team, cluster by cluster.
+    """Sentences that explain what limits the margin of a team, cluster by cluster.
 
     Args:
         team: the team.
-        optimum: what `consat.certify.optimum.max_min` found for it.
+        optimum: its optimum from `consat.certify.optimum.max_min`.
     """
     if not len(team.owner):
         return ["No agent has a constraint."]
@@ -92,7 +92,7 @@ def explain(team: Team, optimum: Optimum) -> list[str]:
 
 
 def _binding(multipliers: Floats, mine: Bools) -> list[int]:
-    """Which constraints bind, the strongest first: in a large team each bears a small part."""
+    """Indices of the binding constraints, the largest multiplier first. The threshold is relative: in a large team all are small."""
     heavy = np.flatnonzero(mine & (multipliers > BINDING * np.max(multipliers[mine], initial=0.0)))
     return [int(k) for k in heavy[np.argsort(-multipliers[heavy], kind="stable")]]
 
@@ -113,12 +113,15 @@ def _conflict(team: Team, optimum: Optimum, mine: Bools, margin: float) -> Itera
 
 
 def _infeasible(team: Team, optimum: Optimum, keep: Bools) -> bool:
-    """Whether some of the constraints are proven incompatible, whatever the others say."""
+    """Whether the constraints of an (M,) mask are proven incompatible on their own."""
     return bounds(restricted(team, keep), optimum.positions, multipliers=optimum.multipliers[keep]).verdict == "infeasible"
 
 
 def _cure(team: Team, multipliers: Floats, positions: Floats, margin: float) -> str | None:
-    """The least relaxation, of the constraint with the best leverage, that is seen to satisfy a cluster."""
+    """A sentence with the smallest relaxation of one constraint that satisfies the cluster when solved again; None if none is found.
+
+    Constraints whose relaxation helps most, relative to the size of the number, are tried first.
+    """
     knobs = sorted(_knobs(team, multipliers, positions), key=lambda knob: -knob.gain * max(abs(knob.now), 1e-300))
     for knob in knobs[:TRIED]:
         amount = _least(functools.partial(_margin, team, knob), -margin / knob.gain, LEAST * (abs(knob.now) or 1.0), margin)
@@ -132,14 +135,21 @@ def _margin(team: Team, knob: _Knob, amount: float) -> float:
 
 
 def _least(solve: Callable[[float], float], guess: float, least: float, margin: float) -> float | None:
-    """The smallest amount from `least` on, rounded up, whose margin is positive; None if none is found. The margin rises with it."""
+    """The smallest amount with a positive margin, rounded up; None if none is found.
+
+    Args:
+        solve: margin as a function of the amount; assumed to increase.
+        guess: first amount to try.
+        least: smallest amount to try.
+        margin: margin for amount 0, not positive.
+    """
     low, high, below = 0.0, max(guess, least), margin
     for tries in range(SOLVES):
         above = solve(high)
         if above > 0:
             break
         if not math.isfinite(above) or (above <= below + 1e-9 * abs(margin) and tries > 1):
-            return None  # it no longer helps: something else is in the way
+            return None  # more of it does not help: another constraint limits the margin
         slope = (above - below) / (high - low)
         low, high, below = high, min(high + 1.05 * abs(above) / slope, 4 * high) if slope > 0 else 2 * high, above
     else:
@@ -165,7 +175,7 @@ def _rounded_up(amount: float) -> float:
 
 @float64
 def _knobs(team: Team, multipliers: Floats, positions: Floats) -> list[_Knob]:
-    """What can be turned: a radius, an offset, the side of a box; otherwise how far ψ may fall short."""
+    """The numbers that can be relaxed in binding constraints: a radius, an offset or the side of a box; for other kinds ψ itself."""
     knobs = []
     for family in team.families:
         for member in np.flatnonzero(multipliers[family.number] > BINDING):
@@ -191,11 +201,11 @@ def _knobs(team: Team, multipliers: Floats, positions: Floats) -> list[_Knob]:
 
 
 STANDARD = ("within", "outside", "near", "apart", "displacement", "halfspace", "box")
-"""Kinds whose parameters mean what their names say."""
+"""Library kinds, whose parameters can be named in a proposal."""
 
 
 def _slopes(family: Family, arguments: Floats, parameters: dict[str, Any]) -> dict[str, Floats]:
-    """∂ψ/∂p of one member for each of its parameters."""
+    """∂ψ/∂p of one member, for each of its floating-point parameters."""
     inexact = {key: jnp.asarray(value) for key, value in parameters.items() if np.issubdtype(np.asarray(value).dtype, np.floating)}
     fixed = {key: value for key, value in parameters.items() if key not in inexact}
 
@@ -208,7 +218,7 @@ def _slopes(family: Family, arguments: Floats, parameters: dict[str, Any]) -> di
 
 @dataclass(frozen=True)
 class _Slackened:
-    """ψ + slack."""
+    """The function ψ + slack, with the parameter ``slack``."""
 
     psi: Callable[..., Any]
 
@@ -217,7 +227,7 @@ class _Slackened:
 
 
 def turned(team: Team, knob: _Knob, amount: float) -> Team:
-    """The team with one constraint relaxed."""
+    """The team with one constraint relaxed by `amount`."""
     families = []
     for family in team.families:
         here = family.number == knob.constraint
@@ -237,7 +247,7 @@ def turned(team: Team, knob: _Knob, amount: float) -> Team:
 
 
 def restricted(team: Team, keep: Bools) -> Team:
-    """The team with only some of its constraints (M,)."""
+    """The team with only the constraints of an (M,) mask."""
     place = np.cumsum(keep) - 1
     families = []
     for family in team.families:
@@ -268,7 +278,7 @@ def _listed(team: Team, constraints: list[int]) -> str:
 
 
 def _label(team: Team, constraint: int) -> str:
-    """``a2's tether to a3``, or ``a2's near(a3)`` where the name says it already."""
+    """Label of a constraint: ``a2's tether to a3``, or ``a2's near(a3)`` if the name already contains the other agents."""
     owner, name = int(team.owner[constraint]), team.names[constraint]
     for family in team.families:
         for member in np.flatnonzero(family.number == constraint):

@@ -1,12 +1,13 @@
-"""How a team could move off for ever without loss: the exact test behind bounded level sets and a unique optimum (design, section 7).
+"""Directions of recession: directions in which a team can move to infinity while no ψ gets worse.
 
-For ψ_k = c_k + b_k·y + ½ yᵀH_k y, going along d for ever makes no ψ_k worse iff d is in
+This is the exact test for bounded level sets and a unique optimum. For ψ_k = c_k + b_k·y + ½ yᵀH_k y, the directions are the set
 
     {d : H_k d = 0 and b_k·d ≥ 0 for all k}.
 
-H d = 0 is first used to merge coordinates: an agent with a ψ that is curved every way in its own position stays, two that a curved ψ of
-their difference ties go together. What is left is small as a rule, and a chain of ten thousand agents, whose smallest eigenvalue drowns in
-rounding, is as clear as one of two. The rest is a rank and a linear program.
+H d = 0 is first used to merge coordinates. An agent with a ψ that is curved in all directions of its position cannot move. Two agents with
+a ψ that is curved in all directions of their difference move together. The remaining problem is usually small. Merging also makes a chain
+of ten thousand agents as well-posed as one of two; its smallest eigenvalue would be lost in rounding errors. What remains is a rank test
+and a linear program.
 """
 
 from __future__ import annotations
@@ -21,23 +22,22 @@ from scipy.sparse.linalg import splu
 from consat.certify.quadratics import Bools, Expansion, Floats, Ints
 
 FLAT = 1e-10
-"""A direction along which every ψ changes by less than this part of its own size is one that leaves it as it is. Ill-posed in between:
-whoever writes two walls that are parallel to ten digits is told that they are."""
+"""Relative changes of ψ below this count as 0. Two walls that are parallel to ten digits are therefore treated as parallel."""
 NULL = 1e-13
-"""An eigenvalue of a sum of squares below this part of the largest is zero; a chain of a million links still has 2e-12."""
+"""An eigenvalue of a sum of squares below this fraction of the largest counts as 0. A chain of a million links still has 2e-12."""
 MOST_DENSE = 500
-"""Up to so many merged coordinates the rank is found by eigenvalues, above by inverse iteration."""
+"""Up to this many merged coordinates the null space is found by eigenvalues, above by inverse iteration."""
 MOST_PROGRAMMED = 200_000
-"""Up to so many merged coordinates the linear program is solved; beyond, nothing is said."""
+"""Up to this many merged coordinates the linear program is solved. Above, the result is unknown."""
 
 
 class Recession(NamedTuple):
-    """How a team can move without any ψ getting worse, in the end.
+    """Result of the test for directions of recession.
 
     Attributes:
-        bounded: whether it cannot; None if unknown.
-        invariant: whether there is a way that leaves every ψ as it is; None if unknown.
-        adrift: (N,) agents that such a way moves.
+        bounded: whether there is no such direction, so that level sets are bounded; None if unknown.
+        invariant: whether there is a direction that changes no ψ at all; None if unknown.
+        adrift: (N,) whether the direction found moves the agent.
     """
 
     bounded: bool | None
@@ -46,11 +46,11 @@ class Recession(NamedTuple):
 
 
 def recession(model: Expansion, read: Bools) -> Recession:
-    """The exact test.
+    """Test for directions of recession.
 
     Args:
-        model: constraints of degree ≤ 2.
-        read: (N,) the agents that matter, whether or not a constraint of the model reads them.
+        model: expansion of constraints of degree ≤ 2.
+        read: (N,) whether the position of an agent matters. It may be true for an agent that no constraint of `model` reads.
     """
     agents, dimension = model.at.shape
     group, curved = _merged(model)
@@ -80,7 +80,11 @@ def recession(model: Expansion, read: Bools) -> Recession:
 
 
 def _merged(model: Expansion) -> tuple[Ints, list[sparse.csr_array]]:
-    """(N,) groups of agents that H d = 0 moves together, −1 for those that it holds in place; and what is left of H, as rows."""
+    """Merges agents by H d = 0.
+
+    Returns:
+        (N,) group of agents that can only move together, −1 for agents that cannot move; and the remaining rows of H as sparse matrices.
+    """
     agents, dimension = model.at.shape
     held, pairs, left = np.zeros(agents, dtype=bool), [np.zeros((0, 2), dtype=np.intp)], []
     for block in model.blocks:
@@ -114,7 +118,7 @@ def _nonsingular(hessian: Floats) -> Bools:
 
 
 def _onto(group: Ints, dimension: int) -> sparse.csr_array:
-    """(N·d, G·d) from the coordinates of groups to those of their agents."""
+    """(N·d, G·d) sparse matrix from the coordinates of the groups to those of their agents."""
     agents = np.flatnonzero(group >= 0)
     axes = np.arange(dimension)
     rows, columns = (np.add.outer(part * dimension, axes).ravel() for part in (agents, group[agents]))
@@ -123,7 +127,10 @@ def _onto(group: Ints, dimension: int) -> sparse.csr_array:
 
 
 def _unit_slopes(model: Expansion) -> sparse.csr_array:
-    """Rows b_k in units of the larger of ‖b_k‖ and ‖H_k‖ times the spread of the formation: what is small beside these is rounding."""
+    """(M, N·d) rows b_k, each divided by the larger of ‖b_k‖ and ‖H_k‖ times the spread of the formation.
+
+    After this scaling, small entries are rounding errors.
+    """
     slopes, size = model.jacobian(), np.zeros(len(model.value))
     spread = float(np.abs(model.at - model.at.mean(axis=0)).max(initial=0.0))
     for block in model.blocks:
@@ -134,7 +141,7 @@ def _unit_slopes(model: Expansion) -> sparse.csr_array:
 
 
 def _null(matrix: sparse.csr_array) -> Floats | None:
-    """A vector of length 1 (largest entry) that the matrix maps to 0, or None."""
+    """A vector with largest entry 1 that the matrix maps to 0; None if there is none."""
     columns = matrix.shape[1]
     if not columns:
         return None
@@ -143,7 +150,7 @@ def _null(matrix: sparse.csr_array) -> Floats | None:
         size, vectors = np.linalg.eigh(square)
         smallest, largest = size[0], size[-1]
         space = vectors[:, size <= NULL * max(largest, 1.0)]
-        direction = space @ np.random.default_rng(0).normal(size=space.shape[1])  # a mixture, which moves whoever can move
+        direction = space @ np.random.default_rng(0).normal(size=space.shape[1])  # a random combination moves every agent that can move
     else:
         square = (matrix.T @ matrix).tocsc()
         largest = float(sparse.linalg.norm(square, np.inf)) or 1.0
@@ -159,11 +166,11 @@ def _null(matrix: sparse.csr_array) -> Floats | None:
 
 
 def _improving(slopes: sparse.csr_array, flat: sparse.csr_array) -> Floats | None:
-    """d with slopes d ≥ 0, not all 0, and flat d = 0; or None. A linear program over the unit box."""
+    """A vector d with slopes d ≥ 0, not all 0, and flat d = 0, by a linear program over the unit box; None if there is none."""
     columns = slopes.shape[1]
     if not columns:
         return None
-    from scipy.optimize import linprog  # as long to import as a check of a small team takes
+    from scipy.optimize import linprog  # the import takes as long as the check of a small team
 
     gain = np.asarray(slopes.sum(axis=0)).ravel()
     answer = linprog(
