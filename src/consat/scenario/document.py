@@ -1,7 +1,7 @@
-"""YAML 1.2 as plain data that remembers where everything stands. Nothing is ever constructed from a tag.
+"""YAML 1.2 as plain data with the line and column of each value. Tags never construct objects.
 
-ruamel.yaml's parser yields events; the tree is built here, so that the file's places, its depth and its repeated keys are at hand,
-and a hostile file is refused before it takes time or memory. Anchors and aliases are refused too: what is written is what is meant.
+ruamel.yaml's parser yields events, and this module builds the tree. So it knows the place of each value, can report repeated keys, and can
+refuse a hostile file before it costs time or memory. Anchors and aliases are refused, too.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ruamel.yaml.events import (
 from consat.errors import AT_KEY, Fault, InvalidInput, InvalidScenario, Place, shown
 
 LARGEST: Final = 16 * 2**20
-"""Bytes of a file."""
+"""Largest size of a file, bytes."""
 DEEPEST: Final = 40
 
 Path = tuple[str | int, ...]
@@ -56,13 +56,14 @@ _IN_PLAIN_WORDS: Final = (
 
 @dataclass(slots=True)
 class Node:
-    """One value of the file.
+    """One value of the file, with its place.
 
     Attributes:
-        value: text, number, truth value or None; a list of nodes; or a dict of nodes.
-        place: where it starts.
-        key: where its key starts, if it has one.
-        indent: how many columns after `place` its text starts (the quote); None if its text is not written on one line as it is.
+        value: a text, number, boolean or None; a list of nodes; or a dict of nodes.
+        place: where the value starts.
+        key: where its key starts; None if it has no key.
+        indent: number of columns between `place` and its text: 1 for a quoted text, else 0. None if the text does not stand in the file
+            unchanged on one line.
     """
 
     value: Any
@@ -72,7 +73,7 @@ class Node:
 
     @property
     def plain(self) -> Any:
-        """Without places."""
+        """The value as plain data, without places."""
         if isinstance(self.value, dict):
             return {key: node.plain for key, node in self.value.items()}
         return [node.plain for node in self.value] if isinstance(self.value, list) else self.value
@@ -80,12 +81,12 @@ class Node:
 
 @dataclass
 class Document:
-    """A file, read.
+    """A parsed file.
 
     Attributes:
-        file: its name, for messages.
-        root: None if the file is empty.
-        faults: found so far, with their places.
+        file: name of the file, for messages.
+        root: the value of the whole file; None if the file is empty.
+        faults: faults found so far, with their places.
     """
 
     file: str
@@ -93,7 +94,12 @@ class Document:
     faults: list[Fault] = field(default_factory=list)
 
     def place(self, path: Path, offset: int = 0) -> Place:
-        """Of the value at `path`, `offset` characters into its text; of the deepest ancestor if there is no such value."""
+        """The place of a value in the file.
+
+        Args:
+            path: path of the value. If there is no such value, the place is that of the deepest existing ancestor.
+            offset: number of characters into the text of the value; or `AT_KEY` for the place of its key.
+        """
         node = self.root
         if node is None:
             return Place(1, 1, self.file)
@@ -110,26 +116,26 @@ class Document:
         return Place(line, column + offset + node.indent, file) if offset and node.indent is not None and line else node.place
 
     def invalid(self, faults: Iterable[Fault] = ()) -> InvalidScenario:
-        """An error with these faults and those of the document, each with its place, in the order of the file."""
+        """An error with the given faults and those of the document, each with its place, in the order of the file."""
         placed = {*self.faults, *(replace(fault, place=self.place(fault.path, fault.offset)) for fault in faults)}
         return InvalidScenario(sorted(placed, key=lambda fault: (fault.place, fault.message)))
 
     def broken(self, message: str, place: Place) -> InvalidScenario:
-        """An error that ends the reading."""
+        """An error for a file that cannot be read any further; includes the faults found so far."""
         self.faults.append(Fault((), message, "YAML", place=place))
         return self.invalid()
 
 
 def locate(error: InvalidInput, document: Document) -> InvalidScenario:
-    """`error` with the places of its faults."""
+    """The error with the places of its faults in the document."""
     return error if isinstance(error, InvalidScenario) else Document(document.file, document.root).invalid(error.faults)
 
 
 def decode(content: bytes, file: str) -> str:
-    """The text of a file.
+    """The text of a file, from its bytes.
 
     Raises:
-        InvalidScenario: it is too large, or no UTF-8.
+        InvalidScenario: the file is larger than `LARGEST`, or not UTF-8.
     """
     if len(content) > LARGEST:
         message = f"the file is larger than {LARGEST // 2**20} MB; no scenario needs that"
@@ -143,15 +149,16 @@ def decode(content: bytes, file: str) -> str:
 
 
 def read(text: str, file: str, place: Callable[[StreamMark], Place] | None = None) -> Document:
-    """Read YAML.
+    """Parse YAML.
 
     Args:
         text: the YAML.
-        file: its name, for messages.
-        place: what messages call a mark, if not by line and column.
+        file: name of the file, for messages.
+        place: function from a parser mark to a place. If None, the place is the line and column of the mark.
 
     Raises:
-        InvalidScenario: the text is not YAML, or more than this reads. Repeated keys and the like are left in `Document.faults`.
+        InvalidScenario: the text is not YAML, or uses YAML that is not supported. Lesser faults, such as repeated keys, are left in
+            `Document.faults`.
     """
     document = Document(file)
     where = place or (lambda mark: Place(mark.line + 1, mark.column + 1, file))
@@ -165,18 +172,18 @@ def read(text: str, file: str, place: Callable[[StreamMark], Place] | None = Non
     except MarkedYAMLError as error:
         marks = [error.problem_mark, error.context_mark]
         if "end of stream" in str(error.problem) or "<stream end>" in str(error.problem):
-            marks.reverse()  # what is never closed is found where it is opened
+            marks.reverse()  # an unclosed quote or bracket is reported where it opens
         at = where(marks[0] or marks[1] or reader.mark)
         raise document.broken(_in_plain_words(str(error.problem)), at) from None
     except InvalidScenario:
         raise
-    except (YAMLError, ArithmeticError, ValueError) as error:  # an escape such as "\UFFFFFFFF" slips through as one of the latter
+    except (YAMLError, ArithmeticError, ValueError) as error:  # ruamel.yaml raises one of the latter for an escape such as "\UFFFFFFFF"
         raise document.broken(_in_plain_words(str(error)), where(reader.mark)) from None
     return document
 
 
 class _Reader:
-    """From the parser's events to nodes."""
+    """Builds nodes from the events of the parser."""
 
     def __init__(self, events: Iterator[Event], document: Document, place: Callable[[StreamMark], Place]) -> None:
         self.events = events
@@ -256,7 +263,7 @@ def _scalar(event: ScalarEvent, place: Place) -> Node:
 
 
 def resolve(text: str) -> Any:
-    """What an unquoted text stands for, by the core schema of YAML 1.2; integers of hundreds of digits become floats."""
+    """The value of an unquoted text, by the core schema of YAML 1.2. Integers of more than 300 digits become floats."""
     if text in _WORDS:
         return _WORDS[text]
     if _INTEGER.fullmatch(text):

@@ -1,4 +1,4 @@
-"""Scenarios from files, from text, and from the package."""
+"""Reads scenarios from files, from text, and from the package."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _PACKAGE = resources.files("consat.scenario")
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A team and how it is run.
+    """A team and the settings of its runs.
 
     Attributes:
-        name: for reports.
+        name: name for reports.
         team: the agents, their constraints and links.
-        settings: start, protocol, smoothing.
-        text: YAML that gives this scenario, overrides included; empty if no text can (own callables).
+        settings: start, protocol and smoothing.
+        text: YAML of this scenario, overrides included; empty if the team has Python functions, which YAML cannot hold.
         source: the file or packaged name it was read from.
-        document: where everything stands in it, if it was read.
-        robots: and obstacles; None if agents are points that go where they want.
-        rate: rounds a second, Hz; None if it does not say.
+        document: the parsed file, with the places of all values; None if the scenario was not read from text.
+        robots: robots and obstacles; None if agents are points that move freely.
+        rate: rounds per second, Hz; None if not given.
     """
 
     name: str
@@ -53,11 +53,11 @@ def load(source: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scena
     """Read a scenario.
 
     Args:
-        source: the path of a file, or a packaged name such as ``case-b``; a file of that name wins.
-        overrides: ``path=value`` strings, e.g. ``start.box=[-9, 9]`` or ``agents.a1.constraints.0.radius=2``.
+        source: path of a file, or a packaged name such as ``case-b``. An existing file takes precedence over a packaged name.
+        overrides: ``path=value`` texts, e.g. ``start.box=[-9, 9]`` or ``agents.a1.constraints.0.radius=2``.
 
     Raises:
-        InvalidScenario: names every fault with its line and column.
+        InvalidScenario: the scenario has faults. The message names every fault with its line and column.
     """
     file = os.fspath(source)
     text = packaged_text(file) if file in packaged() and not Path(file).is_file() else _text(file)
@@ -69,11 +69,11 @@ def loads(text: str, name: str = "scenario", overrides: Sequence[str] = ()) -> S
 
     Args:
         text: the YAML.
-        name: what messages call the file; the scenario's own name if the text gives none.
-        overrides: as for `load`.
+        name: name of the file in messages. It is also the name of the scenario if the text gives none.
+        overrides: as in `load`.
 
     Raises:
-        InvalidScenario: names every fault with its line and column.
+        InvalidScenario: the scenario has faults. The message names every fault with its line and column.
     """
     document = read(text, name)
     for each in overrides:
@@ -85,7 +85,7 @@ def loads(text: str, name: str = "scenario", overrides: Sequence[str] = ()) -> S
 
 
 def located(error: InvalidInput, scenario: Scenario) -> InvalidScenario:
-    """An error that arose after loading, such as a cluster without links, with the places of its faults in the scenario's file."""
+    """The error with the places of its faults in the scenario's file. For errors found after loading, such as a disconnected cluster."""
     return locate(error, scenario.document) if scenario.document else InvalidScenario(error.faults)
 
 
@@ -102,7 +102,7 @@ def packaged_text(name: str) -> str:
 
 
 def template() -> str:
-    """A starting scenario, with comments."""
+    """The YAML of a commented example scenario, to start from."""
     return (_PACKAGE / "template.yaml").read_text(encoding="utf-8")
 
 

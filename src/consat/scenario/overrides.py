@@ -1,4 +1,4 @@
-"""``--set path=value``: change a scenario before it is checked."""
+"""``--set path=value``: changes values of a scenario before it is checked."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from consat.scenario.document import Document, Node, Path, read
 
 
 def override(document: Document, text: str) -> None:
-    """Change one value of `document`; what is wrong with `text` is added to its faults.
+    """Change one value of a document. Faults of `text` are added to those of the document.
 
     Args:
-        document: to be changed.
-        text: ``path=value``. The path is dotted: keys, indices counted from 0, and ids of agents, e.g. ``agents.a1.constraints.0.radius``.
-            Keys that do not exist are made. The value is YAML; an empty one takes the key away.
+        document: the document to change.
+        text: ``path=value``. The path has dots between keys, indices from 0, and ids of agents, e.g. ``agents.a1.constraints.0.radius``.
+            Missing keys are created. The value is YAML; an empty value removes the key.
     """
     dots, equals, value = text.partition("=")
     place = Place(0, 0, "--set " + "".join(char if char.isprintable() else "?" for char in text[:120]))
@@ -28,7 +28,7 @@ def override(document: Document, text: str) -> None:
     except InvalidScenario as error:
         document.faults += error.faults
         return
-    document.faults += [replace(fault, path=()) for fault in new.faults]  # their paths begin at the value
+    document.faults += [replace(fault, path=()) for fault in new.faults]  # their paths start at the value, not at the root of the document
     node = new.root or Node(None, place)
     node.place = node.key = place
     document.root = document.root or Node({}, place)
@@ -36,7 +36,15 @@ def override(document: Document, text: str) -> None:
 
 
 def _put(parent: Node, parts: list[str], new: Node, document: Document, path: Path) -> None:
-    """Hang `new` into `parent` where `parts` lead."""
+    """Insert a node into the tree.
+
+    Args:
+        parent: node at which `parts` start.
+        parts: keys and indices that lead to the place of the new node.
+        new: the node to insert.
+        document: receives faults.
+        path: path of `parent`.
+    """
     part, *rest = parts
     if parent.value is None:
         parent.value, parent.place = {}, new.place
@@ -64,7 +72,7 @@ def _put(parent: Node, parts: list[str], new: Node, document: Document, path: Pa
 
 
 def _index(nodes: list[Node], part: str) -> int | None:
-    """Of the entry of that id or number."""
+    """The index of the list entry with this id, name or number; None if there is none."""
     by_id = next((index for index, node in enumerate(nodes) if _id(node) == part), None)
     if by_id is None and part.isascii() and part.isdigit() and len(part) < 10 and int(part) < len(nodes):
         return int(part)
@@ -72,7 +80,7 @@ def _index(nodes: list[Node], part: str) -> int | None:
 
 
 def _id(node: Node) -> str | None:
-    """What an entry of a list calls itself."""
+    """The id or name of a list entry; None if it has none."""
     if not isinstance(node.value, dict):
         return None
     name = next((node.value[key].value for key in ("id", "name") if key in node.value), None)

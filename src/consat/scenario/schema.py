@@ -1,4 +1,5 @@
-"""Plain data as a team and its settings: the keys. What a value may be is known to `consat.problem.team` and `consat.settings`."""
+"""Builds a team and settings from the plain data of a scenario file. Checks the keys; `consat.problem.team` and `consat.settings` check
+the values."""
 
 from __future__ import annotations
 
@@ -30,14 +31,14 @@ KEYS: Final = ("consat", "name", "dimension", "unit", "count", "agents", "commun
 AGENT_KEYS: Final = ("id", "start", "robot", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
-"""Keys that constraints of a group have besides those of their kind."""
+"""Additional keys of constraints in a group, besides those of their kind."""
 TEXT: Final = (str, str | None, "str", "str | None")
-"""Arguments of a factory that are annotated so are text in a scenario file."""
+"""Annotations of those arguments of a factory that must be text in a scenario file."""
 COMMUNICATION_KEYS: Final = ("links", "graph")
 
 
 class _Faults:
-    """Collects; of two faults at one place, or one within the other's, the first is kept: the rest would be its consequence."""
+    """Collects faults. A fault at or below the path of an earlier one is dropped, because it is usually a consequence of it."""
 
     def __init__(self, known: Iterable[Fault]) -> None:
         self.found: list[Fault] = []
@@ -52,20 +53,20 @@ class _Faults:
         self.paths |= {fault.path for fault in fresh}
 
     def keys(self, path: Path, data: Mapping[str, Any], allowed: Sequence[str], where: str = "") -> dict[str, Any]:
-        """What is given: a key without a value (null) is not."""
+        """The entries of a mapping whose keys are allowed and whose values are not null. Adds a fault for each unknown key."""
         self.take([unknown_key((*path, key), allowed, where) for key in data if key not in allowed])
         return {key: data[key] for key in data if key in allowed and data[key] is not None}
 
 
 class Built(NamedTuple):
-    """What a scenario file says.
+    """The content of a scenario file.
 
     Attributes:
         team: the team.
-        settings: of a run.
-        name: if there is one.
-        robots: and obstacles, if there are any.
-        rate: rounds a second, Hz, if it says.
+        settings: settings of a run.
+        name: name of the scenario; None if not given.
+        robots: robots and obstacles; None if there are no robots.
+        rate: rounds per second, Hz; None if not given.
     """
 
     team: Team
@@ -76,10 +77,10 @@ class Built(NamedTuple):
 
 
 def build(document: Document) -> Built:
-    """What the file says.
+    """Build the team and the settings from a parsed file.
 
     Raises:
-        InvalidScenario: with all faults and their places.
+        InvalidScenario: the file has faults. The error holds all of them, with their places.
     """
     data = document.root.plain if document.root else None
     if not isinstance(data, dict):
@@ -119,7 +120,7 @@ def _rate(data: Any, faults: _Faults) -> float | None:
 
 
 def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots | None:
-    """The robots and the obstacles; None if there are none."""
+    """The robots and obstacles; None if there are no robots, or if they have faults."""
     agents = data.get("agents")
     if not any(key in data for key in ("robots", "obstacles")) and not _any_robot(agents):
         return None
@@ -136,7 +137,7 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
         return None
     base = common if isinstance(common, dict) else {"kind": "point"}
     whole = _made(functools.partial(model_of, base), ("robots",), "robots", faults)
-    if whole is None:  # a fault of all is none of each
+    if whole is None:  # a fault of the common description is reported once, not for each agent
         return None
     each_own = {
         str(entry.get("id")): model
@@ -179,7 +180,7 @@ def _any_robot(agents: Any) -> bool:
 
 
 def _made(make: Callable[[], Any], path: Path, where: str, faults: _Faults) -> Any:
-    """What is made, or None and its faults, which begin at `path`."""
+    """The result of `make`; None if it raises, with its faults added at `path`."""
     try:
         return make()
     except InvalidInput as error:
@@ -188,7 +189,7 @@ def _made(make: Callable[[], Any], path: Path, where: str, faults: _Faults) -> A
 
 
 def _crowded(robots: Robots, team: Team, rate: float | None) -> list[Fault]:
-    """Starts within an obstacle, or on top of each other; of those that are given."""
+    """Faults of given starts that lie in an obstacle or overlap each other."""
     from consat.robots.obstacles import map_of, start_faults
 
     given = np.flatnonzero(np.isfinite(team.starts).all(axis=1))
@@ -251,7 +252,7 @@ def _links(data: Any, faults: _Faults) -> Links:
 
 
 def _agents(data: Any, count: Any, faults: _Faults) -> list[Agent | Group]:
-    """Agents and groups; `count` is that of groups that have none of their own."""
+    """The agents and groups. `count` is the number of members of each group that gives none itself."""
     if data is None:
         faults.add(("agents",), "agents is missing; it must be a list such as [{id: a1, constraints: [..]}]")
         return []
@@ -296,7 +297,7 @@ def _group(data: dict[str, Any], count: Any, path: Path, faults: _Faults) -> Gro
 
 
 def _each(data: Any, path: Path, where: str, faults: _Faults) -> Each:
-    """A constraint of a group, with what it says of the member that has it."""
+    """A constraint of a group, with the keys `MEMBER_KEYS` that select its owners and the agent it reads."""
     if not isinstance(data, dict):
         return Each(_constraint(data, path, where, faults))
     keys = MEMBER_KEYS if data.get("kind") == "expr" else MEMBER_KEYS[:1]
@@ -312,7 +313,18 @@ def _constraints(data: dict[str, Any], path: Path, where: str, faults: _Faults) 
 
 
 def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tuple[str, ...] | None = None) -> Any:
-    """The constraint, or constraints; an empty list if the faults leave nothing to check. `besides`: keys not meant for it, in a group."""
+    """The constraint made from its mapping in the file.
+
+    Args:
+        data: the mapping.
+        path: path of the mapping.
+        owner: the agent or group in words, for faults.
+        faults: receives faults.
+        besides: in a group, keys that are allowed but not arguments of the factory; None outside of a group.
+
+    Returns:
+        a constraint, or a list of them for a box; an empty list if the faults leave nothing to check.
+    """
     where = f"{owner}, constraint {int(path[-1]) + 1}"
     if not isinstance(data, dict):
         faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{kind: within, center: [2, 0], radius: 1}}", where)
@@ -329,7 +341,7 @@ def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tup
     keys = _keys(kind)
     data = faults.keys(path, data, ("kind", *keys, *(besides or ())), where)
     needed = [key for key, parameter in keys.items() if parameter.default is parameter.empty]
-    # What is needed and missing gets a stand-in. The team's complaint about it is dropped: its place has a fault already.
+    # A missing required argument is replaced by "". The team's fault about it is dropped, because its path has a fault already.
     given: dict[str, Any] = dict.fromkeys(needed, "")
     for key, parameter in keys.items():
         text = besides is None if key == "agent" else parameter.annotation in TEXT
@@ -348,5 +360,5 @@ def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tup
 
 @functools.cache
 def _keys(kind: str) -> Mapping[str, inspect.Parameter]:
-    """The arguments of the factory."""
+    """The parameters of the factory of a kind, by name."""
     return inspect.signature(KINDS[kind]).parameters

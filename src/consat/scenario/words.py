@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with the settings, in the words of the scenario file."""
+"""Translates pydantic's errors about the settings to faults in the terms of a scenario file."""
 
 from __future__ import annotations
 
@@ -16,15 +16,22 @@ from consat.settings import Settings
 
 
 def unknown_key(path: Path, allowed: Collection[str], where: str = "") -> Fault:
-    """The fault of a key that should not be there."""
+    """The fault for an unknown key.
+
+    Args:
+        path: path that ends with the key.
+        allowed: the known keys.
+        where: the place in words; by default the dotted path of the parent.
+    """
     message = f"there is no key {shown(path[-1])}; the keys are {', '.join(allowed)}{closest(path[-1], allowed)}"
     return Fault(path, message, where or dotted(path[:-1]) or "scenario", AT_KEY)
 
 
 def complaints(error: ValidationError, data: Mapping[str, Any]) -> list[Fault]:
-    """The faults of `data`, which are no `Settings`: one for each value, the innermost where one lies in the other.
+    """The faults of `data` that failed validation as `Settings`: one for each value, and of nested values only the innermost.
 
-    A value that may take several forms makes pydantic complain about each; only what it must be on the whole is of use.
+    For a value that may take several forms, pydantic reports an error for each form. They are merged into one fault, which says what the
+    value must be.
     """
     found: dict[Path, Fault] = {}
     for item in error.errors(include_url=False):
@@ -35,7 +42,7 @@ def complaints(error: ValidationError, data: Mapping[str, Any]) -> list[Fault]:
 
 
 def _path(item: ErrorDetails, data: Any) -> Path:
-    """Where in `data`; pydantic's own path also names the forms it tried."""
+    """The path in `data` of a pydantic error. Pydantic's own path also contains the names of the forms it tried; they are left out."""
     path: list[str | int] = []
     for part in item["loc"]:
         if isinstance(data, dict) and part in data:
@@ -64,7 +71,7 @@ def _fault(path: Path, item: ErrorDetails, data: Any) -> Fault:
 
 
 def _fields(path: Path) -> dict[str, FieldInfo]:
-    """The fields that the settings have at `path`, by the keys of the file."""
+    """The fields of the settings at `path`, by their key in a scenario file."""
     model: type[BaseModel] = Settings
     for part in path:
         annotation = _by_key(model)[str(part)].annotation

@@ -1,6 +1,6 @@
-"""Team and settings as the text of a scenario file.
+"""Writes a team and its settings as the text of a scenario file.
 
-YAML 1.2 contains JSON, so short values are written in its style; the layout is chosen for reading.
+Short values are written in the style of JSON, which is part of YAML 1.2. The layout is chosen for human readers.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from consat.robots.description import Robots
 
 WIDTH: Final = 110
-"""Lists and mappings up to this many characters stand on one line."""
+"""Lists and mappings of up to this many characters are written on one line."""
 
 MOST_WRITTEN: Final = 10_000
-"""Up to so many agents are written one by one."""
+"""Largest number of single agents, and of links, that are written."""
 
 _WORDS = re.compile(r"[A-Za-z][\w-]*( [\w-]+)*", re.ASCII)
 _UNPRINTED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
@@ -40,17 +40,18 @@ _UNPRINTED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
 def dump(
     team: Team, settings: Settings | None = None, name: str = "team", *, robots: Robots | None = None, rate: float | None = None
 ) -> str:
-    """The scenario file of a team; loading it gives the same team.
+    """The text of a scenario file for a team. Loading it gives an equal team.
 
     Args:
-        team: built of library constraints and text expressions. A `consat.box` is written as the half-spaces it consists of.
-        settings: start, protocol and smoothing are written; the rest is for the command line.
-        name: of the scenario.
-        robots: and obstacles, if agents are no points that go where they want.
-        rate: rounds a second, Hz.
+        team: a team with library constraints and text expressions only. A `consat.box` is written as half-spaces.
+        settings: start, protocol and smoothing of the file; defaults are left out.
+        name: name of the scenario.
+        robots: robots and obstacles; None if agents are points that move freely.
+        rate: rounds per second, Hz.
 
     Raises:
-        InvalidTeam: names the constraints that are Python functions: no file can hold them.
+        InvalidTeam: the team cannot be written: constraints are Python functions (the message names them), a group has separate values for
+            each member, or there are too many single agents or links.
     """
     grouped = team.members is not None and any(isinstance(member, Group) for member in team.members)
     if not grouped and team.count > MOST_WRITTEN:
@@ -75,7 +76,7 @@ def dump(
 
 
 def _agents(team: Team) -> Iterator[dict[str, Any]]:
-    """The agents that are written one by one."""
+    """The entries of the agents that are not members of a group."""
     grouped = np.zeros(team.count, dtype=bool)
     first = 0
     for member in team.members or ():
@@ -105,8 +106,13 @@ def _agents(team: Team) -> Iterator[dict[str, Any]]:
 def _group(group: Group, place: int, same_count: bool) -> dict[str, Any]:
     """The entry of a group.
 
+    Args:
+        group: the group.
+        place: its index among the agents and groups, for faults.
+        same_count: whether its count is written once for all groups.
+
     Raises:
-        InvalidTeam: it has values of its own for each member.
+        InvalidTeam: the group has a separate value for each member, or a Python function.
     """
     path = ("agents", place)
     where = f"group {group.name!r}"
@@ -131,7 +137,7 @@ def _group(group: Group, place: int, same_count: bool) -> dict[str, Any]:
 
 
 def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
-    """The entry of a group's constraint; None if no file can hold it."""
+    """The entry of a constraint of a group; None if a file cannot hold it."""
     values = {key: _plain(parameter.value) for key, parameter in constraint.parameters.items()}
     arrays = [outer.of, outer.agent, *constraint.reads, *(values.values() if constraint.psi not in _SIDES else ())]
     if any(isinstance(value, np.ndarray) for value in arrays):
@@ -151,7 +157,7 @@ def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
 
 
 def _side(psi: Callable[..., Any], parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The side of a box, as the half-space it is."""
+    """The entry of one side of a box, written as a half-space."""
     sign, bound = _SIDES[psi]
     normal, limit = sign * np.asarray(parameters["axis"], dtype=float), parameters[bound]
     if isinstance(limit, Mapping):
@@ -166,12 +172,12 @@ def _plain(value: Any) -> Any:
 
 
 def write(data: Mapping[str, Any]) -> str:
-    """YAML for plain data."""
+    """The YAML text of plain data."""
     return "\n".join(_lines(data)) + "\n"
 
 
 def _constraints(team: Team, family: Family, chosen: np.ndarray) -> Iterator[dict[str, Any]]:
-    """The entries of these members of a family; without ``kind`` if no file can hold them."""
+    """The entries of the `chosen` members of a family. An entry has no ``kind`` if a file cannot hold the constraint."""
     for k, number in zip(chosen.tolist(), family.number[chosen].tolist(), strict=True):
         parameters = {key: values[k].tolist() for key, values in family.parameters.items()}
         moving = {key: track.schedule(k) for key, track in family.tracks.items()}
@@ -205,7 +211,7 @@ def _kinds() -> Iterator[tuple[Callable[..., Any], str]]:
 _KIND_OF: Final = dict(_kinds())
 _GROUP_DEFAULTS: Final = {field.name: field.default for field in dataclasses.fields(Group)}
 _SIDES: Final = {side.psi: (-1.0, "low") if "low" in side.parameters else (1.0, "high") for side in box([0], [1])}
-"""Of the sides of a box: the sign of their normal, and the parameter that bounds them."""
+"""For the function of each side of a box: the sign of its normal, and the name of its parameter."""
 
 
 def _communication(team: Team) -> dict[str, Any]:
@@ -220,7 +226,7 @@ def _communication(team: Team) -> dict[str, Any]:
 
 
 def _lines(value: Mapping[str, Any] | list[Any]) -> Iterator[str]:
-    """The lines of a block: one an entry where the entry is short and holds no mapping, else its own block, indented."""
+    """The lines of a block. A short entry without a nested mapping takes one line; any other entry is an indented block."""
     entries = [(f"{_flow(key)}:", each) for key, each in value.items()] if isinstance(value, Mapping) else [("-", each) for each in value]
     for lead, each in entries:
         parts = each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
@@ -235,7 +241,7 @@ def _lines(value: Mapping[str, Any] | list[Any]) -> Iterator[str]:
 
 
 def _too_deep(part: Any, lead: str) -> bool:
-    """Whether what holds this part needs a block of its own. An entry of a list may hold a mapping, if that is flat."""
+    """Whether an entry with this part must be written as a block. A list entry on one line may hold a mapping if that is flat."""
     return any(map(_holds_mapping, part.values())) if isinstance(part, dict) and lead == "-" else _holds_mapping(part)
 
 
