@@ -1,4 +1,5 @@
-"""What a run leaves behind: `Trace`, plain arrays; `Result`, which users get; and the NetCDF file.
+"""Results of runs: `Trace` (plain arrays), `Result` (the public object) and the NetCDF file.
 
-In: a trace and its summary. Out: labelled arrays, files. May not import what computes: engine, network, runs.
+Input: a trace and its summary. Output: labelled arrays and files. This package must not import the packages that compute: engine, network,
+runs.
 """

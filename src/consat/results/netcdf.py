@@ -1,4 +1,4 @@
-"""The result file: NetCDF-4, written some steps at a time."""
+"""Writes the result file: NetCDF-4, a chunk of steps at a time."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ VARIABLES: Mapping[str, tuple[tuple[str, ...], Mapping[str, str]]] = {
     "estimate": (("copy", "axis"), {"long_name": "estimate x_j^(i)"}),
     "integral": (("copy", "axis"), {"long_name": "integral state z_i"}),
 }
-"""Of each recorded array its dimensions, after the clock's, and its attributes."""
+"""For each recorded array: its dimensions after that of the clock, and its attributes."""
 FINAL = {"units": "length", "long_name": "last position of every agent, in the team's order"}
-"""Attributes of ``final_position``, (member, axis), which stands where not all agents are recorded."""
+"""Attributes of ``final_position``, (member, axis), which is written if not all agents are recorded."""
 UNITS = {"time": "s", "round": "1"}
 
 
 def axis_names(dimension: int) -> list[str]:
-    """What the axes of space are called."""
+    """The names of the axes of space: x, y, z; in more than three dimensions x1, x2, …"""
     return [AXES[k] if dimension <= len(AXES) else f"x{k + 1}" for k in range(dimension)]
 
 
 def attribute(path: Path, name: str) -> str:
-    """An attribute of a result file.
+    """An attribute of a result file, as text.
 
     Raises:
-        OSError: this is no such file.
-        KeyError: it has no such attribute.
+        OSError: there is no such file, or it is not a NetCDF-4 file.
+        KeyError: the file has no such attribute.
     """
     with h5netcdf.File(path, "r") as file:
         return str(file.attrs[name])
@@ -57,18 +57,21 @@ def write(
     attributes: Mapping[str, Any],
     final: np.ndarray | None,
 ) -> None:
-    """Write a result file, some steps at a time, so that they never are in memory all at once; it appears whole or not at all.
+    """Write a result file in chunks of steps, so that the whole record is never in memory.
+
+    The file is written under a temporary name and renamed at the end, so it is complete or missing.
 
     Args:
-        path: of the file.
+        path: path of the file.
         clock: ``time`` or ``round``.
-        names: which of `VARIABLES`.
-        labels: ``agent`` and ``cluster``, (R,), if anybody is recorded; with estimates ``holder`` and ``held``, (E,).
+        names: the variables to write, of `VARIABLES`.
+        labels: coordinates as `consat.results.result.labels` returns: ``agent`` and ``cluster``, (R,), if any agent is recorded; ``holder``
+            and ``held``, (E,), if estimates are.
         dimension: d.
-        count: how many steps.
-        steps: ``step`` and the variables, with the steps along their first axis.
-        attributes: of the file.
-        final: (N, d) everyone's last positions, if not all are recorded.
+        count: total number of steps.
+        steps: chunks, each with ``step`` and the variables as arrays with the steps along axis 0.
+        attributes: attributes of the file.
+        final: (N, d) last positions of all agents, if not all are recorded; else None.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")

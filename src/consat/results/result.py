@@ -1,4 +1,4 @@
-"""What came out of a run: a summary, labelled arrays, save and load."""
+"""`Result`: the outcome of a run as a summary and labelled arrays. It can be saved and loaded."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 RESULT = "result.nc"
-"""The result file in the directory of a run."""
+"""Name of the result file in the directory of a run."""
 LARGE = 2**28
-"""Bytes of a file beyond which arrays are read only when they are asked for."""
+"""Size of a file, in bytes, above which its arrays are loaded on access only."""
 MOST_EXPLAINED = 200
-"""Agents of a team of which it is said at once what stands in the way; of more, `consat.solve` says it."""
+"""Largest number of agents for which `Result.reasons` explains an infeasible team. For larger teams use `consat.solve`."""
 SLIGHT = 1e-3
-"""A constraint with a smaller multiplier does not bind."""
+"""A constraint with a multiplier up to this does not bind."""
 
 
 class Result:
@@ -36,7 +36,7 @@ class Result:
     Attributes:
         summary: what ``consat run --json`` prints: status, verdict, margin, bounds, satisfied_from, positions, agents …
         data: labelled arrays over time (or round), agent and axis; see `dataset`.
-        scenario: the scenario text, or None for a team that no text can say (own callables).
+        scenario: text of the scenario; None if the team has Python functions, which a scenario file cannot hold.
     """
 
     def __init__(self, summary: Mapping[str, Any], data: xr.Dataset | None = None, *, trace: Trace | None = None, team: Team | None = None,
@@ -49,7 +49,7 @@ class Result:
 
     @functools.cached_property
     def data(self) -> xr.Dataset:
-        """The recorded arrays with named dimensions, units and everything needed to repeat the run among the attributes."""
+        """The recorded arrays with named dimensions and units. The attributes hold everything needed to repeat the run."""
         if self._data is not None:
             return self._data
         assert self._trace is not None
@@ -60,7 +60,7 @@ class Result:
 
     @functools.cached_property
     def team(self) -> Team | None:
-        """The team that was run; read from the scenario text after loading, None if there is none."""
+        """The team of the run. After loading, it is read from the scenario text; None if there is no text."""
         if self._team is not None or self.scenario is None:
             return self._team
         from consat.scenario import loads
@@ -68,28 +68,28 @@ class Result:
         return loads(self.scenario, name=self.summary["scenario"]).team
 
     def binding(self, name: str) -> list[str]:
-        """The agents on whom their constraint of this name binds at the end of the run; empty where agents are not listed."""
+        """The ids of agents whose constraint with this name binds at the end of the run; empty if the summary does not list agents."""
         agents = (self.summary["agents"] or {}).items()
         return [agent for agent, told in agents if any(c["name"] == name and (c["multiplier"] or 0) > SLIGHT for c in told["constraints"])]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write NetCDF-4; `Result.load` reads it back without loss."""
+        """Write a NetCDF-4 file, which `Result.load` reads back without loss. Returns its path."""
         target = Path(path)
         if self._trace is not None and self._trace.file is not None and target.resolve() == self._trace.file.resolve():
-            return target  # it was written as the run went on
+            return target  # the file was written during the run
         target.parent.mkdir(parents=True, exist_ok=True)
         self.data.to_netcdf(target, engine="h5netcdf", format="NETCDF4")
         return target
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Result:
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Args:
-            path: of the file, or of the directory of a run, which holds it.
+            path: path of the file, or of the directory of a run that contains it.
 
         Raises:
-            InvalidResult: no such file, or not a result of consat.
+            InvalidResult: there is no such file, or it is not a result of consat.
         """
         path = Path(path) / RESULT if Path(path).is_dir() else Path(path)
         if not path.is_file():
@@ -104,25 +104,25 @@ class Result:
         return cls(summary, data, scenario=scenario or None)
 
     def plot(self, directory: str | os.PathLike[str] | None = None) -> list[Path]:
-        """The figures of the run, as files in `directory`, or on the screen if None; see `consat.views.figures`."""
+        """Draw the figures of the run: as files in `directory`, or on the screen if None. See `consat.views.figures`."""
         from consat.views import figures
 
         return figures.save(self, directory) if directory is not None else figures.show(self)
 
     def animate(self, path: str | os.PathLike[str]) -> Path:
-        """The run as an animated GIF, or an MP4 video; see `consat.views.animation`."""
+        """Write the run as an animated GIF or an MP4 video; see `consat.views.animation`."""
         from consat.views import animation
 
         return animation.save(self, path)
 
     def html(self, path: str | os.PathLike[str]) -> Path:
-        """The run as one HTML file that replays it offline; see `consat.views.replay`."""
+        """Write the run as one HTML file that replays it offline; see `consat.views.replay`."""
         from consat.views import replay
 
         return replay.save(self, path)
 
     def export(self, path: str | os.PathLike[str]) -> Path:
-        """The run as a file of another kind, which the ending says: .csv, .gif, .html, .mcap, .mp4; see `consat.views.export`."""
+        """Write the run in the format of the file name's ending: .csv, .gif, .html, .mcap, .mp4. See `consat.views.export`."""
         from consat.views import export
 
         return export.save(self, path)
@@ -134,8 +134,10 @@ class Result:
 
     @functools.cached_property
     def reasons(self) -> list[str]:
-        """What conflicts in a team that cannot be satisfied, how much is missing, and what would do, as `consat.solve` says it; empty for
-        others, and for teams of more than `MOST_EXPLAINED` agents."""
+        """Sentences that explain why the team cannot be satisfied, as `consat.solve` gives them: the conflict, how much is missing, a cure.
+
+        Empty unless the verdict is ``infeasible``, and for teams of more than `MOST_EXPLAINED` agents.
+        """
         team = self.team if self.summary["verdict"] == "infeasible" else None
         if team is None or team.count > MOST_EXPLAINED:
             return []
@@ -164,13 +166,13 @@ def _read(path: Path) -> xr.Dataset:
 def labels(
     ids: Sequence[str], agents: np.ndarray | None, cluster: np.ndarray, copies: tuple[np.ndarray, np.ndarray] | None
 ) -> dict[str, np.ndarray]:
-    """Who is who in a record: ``agent`` and ``cluster``, (R,), if anybody is recorded; with estimates ``holder`` and ``held``, (E,).
+    """The coordinates of a record: (R,) ``agent`` and ``cluster`` if any agent is recorded; (E,) ``holder`` and ``held`` if estimates are.
 
     Args:
-        ids: of the team.
-        agents: (R,) who is recorded; all if None.
-        cluster: (N,) of each agent.
-        copies: (E,) holder and (E,) held, if estimates are recorded.
+        ids: ids of the team.
+        agents: (R,) indices of the recorded agents; None for all.
+        cluster: (N,) cluster of each agent.
+        copies: (E,) holder and (E,) held agent of each recorded estimate; None if estimates are not recorded.
     """
     found: dict[str, np.ndarray] = {}
     if agents is None or len(agents):
@@ -183,20 +185,27 @@ def labels(
 
 
 def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool, heading: bool) -> list[str]:
-    """What is recorded, of people with these `labels`."""
+    """The names of the recorded variables.
+
+    Args:
+        named: the coordinates, as `labels` returns.
+        integral: whether integral states are recorded.
+        bound: whether bounds on the margin are recorded.
+        heading: whether headings are recorded.
+    """
     of_agents = ["position", "velocity", "agent_margin", *(["heading"] if heading else [])] if "agent" in named else []
     of_copies = ["estimate", *(["integral"] if integral else [])] if "holder" in named else []
     return ["margin", "smooth_margin", *(["bound"] if bound else []), *of_agents, *of_copies]
 
 
 def attributes(summary: Mapping[str, Any], scenario: str | None) -> dict[str, Any]:
-    """Of a result file: everything that is known at the end of a run."""
+    """The attributes of a result file: schema, summary, scenario text, and some values of the summary."""
     told = {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
     return {"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or "", **told}
 
 
 def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> xr.Dataset:
-    """A trace with names: dimensions time or round, agent, axis, and for copies `copy` with its holder and the agent it is of."""
+    """A trace as a labelled dataset. Dimensions: time or round, agent, axis; for estimates ``copy``, with its holder and the agent held."""
     import xarray as xr
 
     clock = trace.clock

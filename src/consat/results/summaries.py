@@ -1,4 +1,4 @@
-"""What summaries hold: the keys of ``run --json`` and ``sweep --json``, for type checkers and readers."""
+"""Typed dictionaries of the summaries that ``run --json`` and ``sweep --json`` print."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Verdict = Literal["feasible", "infeasible", "undecided"]
 
 
 class SatisfiedFrom(TypedDict):
-    """The first step after the last one whose margin was ≤ 0, as a time in s and as a round; None where there is none."""
+    """The first step after the last step with a margin ≤ 0, as a time in s and as a round; None if there is none."""
 
     time: float | None
     round: float | None
@@ -24,14 +24,14 @@ class ConstraintSummary(TypedDict):
 
 
 class AgentSummary(TypedDict):
-    """One agent at the end of a run; its margin is None without constraints."""
+    """One agent at the end of a run. The margin is None if it has no constraints."""
 
     margin: float | None
     constraints: list[ConstraintSummary]
 
 
 class RunSummary(TypedDict):
-    """What ``consat run --json`` prints (schema consat.run/1)."""
+    """The output of ``consat run --json`` (schema consat.run/1)."""
 
     schema: Literal["consat.run/1"]
     scenario: str
@@ -69,7 +69,7 @@ class RunSummary(TypedDict):
 
 
 class SweepSummary(TypedDict):
-    """What ``consat sweep --json`` prints (schema consat.sweep/1)."""
+    """The output of ``consat sweep --json`` (schema consat.sweep/1)."""
 
     schema: Literal["consat.sweep/1"]
     scenario: str

@@ -1,4 +1,4 @@
-"""What a run leaves behind, as plain arrays: every way of running a team, in one process or over a network, ends in a `Trace`."""
+"""`Trace`: the record of a run as plain arrays. Every run ends in one, in one process or over a network."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ Ending = Literal["satisfied", "settled", "out of time", "diverged", "too stiff",
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A run as it was recorded at T steps.
+    """The record of a run at T steps.
 
     Attributes:
-        clock: what `steps` counts: ``time`` in s, or ``round``.
-        steps: (T,).
-        position: (T, N, d) the agents' own positions, in the scenario's unit of length.
-        velocity: (T, N, d) u_i, length/s.
+        clock: unit of `steps`: ``time`` in s, or ``round``.
+        steps: (T,) increasing.
+        position: (T, N, d) positions of the agents, in the scenario's unit of length; (T, R, d) if `recorded` is given.
+        velocity: (T, N, d) velocity commands u_i, length/s; (T, R, d) if `recorded` is given.
         margin: (T,) β̄ at the positions.
         smooth_margin: (T,) β at the positions.
-        agent_margin: (T, N) ᾱ_i.
-        estimate: (T, C, d) all copies, or None where not recorded.
-        integral: (T, C, d) the integral states, or None.
-        bound: (T,) on the best margin, proven by all agents, NaN where none is; None where nobody proves any.
-        holder: (C,) who holds each copy.
-        held: (C,) whose position it is.
+        agent_margin: (T, N) ᾱ_i; (T, R) if `recorded` is given.
+        estimate: (T, C, d) all estimates; None if not recorded.
+        integral: (T, C, d) integral states; None if not recorded.
+        holder: (C,) agent that holds each estimate.
+        held: (C,) agent whose position is estimated.
         cluster: (N,) cluster of each agent.
         ending: why the run ended.
-        satisfied_from: the first step after the last one whose margin was ≤ 0; None if the last margin is.
-        messages: sent in all; None in continuous time.
-        floats_sent: likewise.
-        known: what every agent knows at the end: that all are ``satisfied``, that the team is ``infeasible``, or nothing.
-        known_from: the round since when, or the time, s, where agents take turns in time; None in continuous time, or if they know nothing.
-        seconds: spent on ``compile`` and ``run``.
-        period: of a round, s; None in continuous time, and where rounds take no time.
-        recorded: (R,) which agents `position`, `velocity` and `agent_margin` are of, where not all were recorded, else None.
-        final: (N, d) everyone's last positions, where not all were recorded.
-        violated: (M,) share of all steps, the start among them, at which each constraint was violated; NaN for those that are not watched,
-            see `consat.engine.violations`; None where nobody counted.
-        motion: what is said of a team that moves, see ``run --json``; None in continuous time, and where rounds take no time.
-        heading: (T, N) of bodies, rad; None where they have none.
-        turned: the round after which the team went over from its links to a spanning tree, or None.
-        file: where the record went as the run went on; the arrays above then hold its end only.
+        satisfied_from: first step after the last step with a margin ≤ 0; None if the last margin is ≤ 0.
+        messages: total number of messages sent; None in continuous time.
+        floats_sent: total number of floats sent; None in continuous time.
+        known: what all agents know at the end: that all are ``satisfied``, that the team is ``infeasible``, or None.
+        known_from: the round from which they know it, or the time, s, over a network without common rounds. None in continuous time, and if
+            they know nothing.
+        seconds: wall-clock time spent on ``compile`` and ``run``, s.
+        period: duration of a round, s; None in continuous time, and if rounds take no time.
+        recorded: (R,) indices of the recorded agents; None if all are recorded.
+        final: (N, d) last positions of all agents, if not all are recorded; else None.
+        violated: (M,) fraction of all steps, including the start, at which each constraint is violated. NaN for constraints that are not
+            watched, see `consat.engine.violations`. None if violations were not counted.
+        file: the result file to which the record was written during the run; the arrays then hold its end only. None if there is no file.
+        turned: the round after which the team changed from its links to a spanning tree; None if it did not.
+        bound: (T,) upper bound on the best margin, proven by all agents together; NaN where none is proven. None if no bound is computed.
+        motion: summary of a team that moves, see ``run --json``; None in continuous time, and if rounds take no time.
+        heading: (T, N) headings of the robots, rad; None if they have none.
     """
 
     clock: Literal["time", "round"]
@@ -80,17 +81,17 @@ class Trace:
 
     @property
     def end(self) -> np.ndarray:
-        """(N, d) everyone's last positions."""
+        """(N, d) last positions of all agents."""
         return self.position[-1] if self.final is None else self.final
 
 
 def satisfied_from(steps: np.ndarray, margin: np.ndarray, *, interpolate: bool) -> float | None:
-    """The first step after the last one whose margin was ≤ 0, or None if the last margin is.
+    """The first step after the last step with a margin ≤ 0; None if the last margin is ≤ 0.
 
     Args:
-        steps: (T,) rising.
-        margin: (T,).
-        interpolate: for continuous time, whether to find the zero between two samples.
+        steps: (T,) increasing, s or rounds.
+        margin: (T,) margins.
+        interpolate: whether to interpolate the zero between two samples, for continuous time.
     """
     bad = np.flatnonzero(~(margin > 0))
     if not len(bad):
