@@ -1,4 +1,4 @@
-"""One tree of errors. They are for wrong input only: divergence, time-out and infeasibility are outcomes, see `consat.results.result`."""
+"""The exceptions of consat. They mean wrong input: divergence, time-out and infeasibility are results; see `consat.results.result`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 AT_KEY: Final = -1
-"""As `Fault.offset`: the fault is the key that `Fault.path` ends with, not the value that belongs to it."""
+"""Value of `Fault.offset`: the key at the end of `Fault.path` is wrong, not its value."""
 
 
 class ConsatError(Exception):
-    """Base of every error that consat raises on purpose."""
+    """Base class of all errors that consat raises on purpose."""
 
 
 class Place(NamedTuple):
-    """A place in a file; line and column count from 1, and are 0 where the file as a whole is meant."""
+    """A place in a file. Line and column count from 1; both are 0 for the file as a whole."""
 
     line: int = 0
     column: int = 0
@@ -34,11 +34,11 @@ class Fault:
     """One mistake in the input.
 
     Attributes:
-        path: where it stands, as keys and indices into the scenario, e.g. ``("agents", 1, "constraints", 0, "radius")``.
+        path: place in the scenario as keys and indices, e.g. ``("agents", 1, "constraints", 0, "radius")``.
         message: what is wrong and what would be right.
-        where: the same place in words a person uses, e.g. ``agent 'a2', constraint 'tether'``; may be empty.
-        offset: 0-based, into the text that stands at `path`, where only a part of it is wrong; or `AT_KEY`.
-        place: the same place in a file, once that is known.
+        where: the same place in words, e.g. ``agent 'a2', constraint 'tether'``; may be empty.
+        offset: offset, from 0, of the wrong part within the text at `path`; or `AT_KEY`.
+        place: the same place as line and column of a file, if known.
     """
 
     path: tuple[str | int, ...]
@@ -53,7 +53,7 @@ class Fault:
 
 
 class InvalidInput(ConsatError, ValueError):
-    """Input that cannot be used; carries every fault found, not only the first."""
+    """Input that cannot be used. `faults` holds all faults that were found, not only the first."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
         self.faults = tuple(faults)
@@ -65,7 +65,7 @@ class InvalidTeam(InvalidInput):
 
 
 class InvalidScenario(InvalidInput):
-    """A scenario file that cannot be read as a team and its settings; the message has one ``FILE:LINE:COLUMN:`` line a fault."""
+    """A scenario file that cannot be read as a team and its settings. The message has one line ``FILE:LINE:COLUMN: …`` per fault."""
 
 
 class InvalidExpression(ConsatError, ValueError):
@@ -73,7 +73,7 @@ class InvalidExpression(ConsatError, ValueError):
 
     Attributes:
         message: what is wrong and what would be right.
-        column: 0-based offset into the expression text.
+        column: offset into the text of the expression, from 0.
     """
 
     def __init__(self, message: str, column: int = 0) -> None:
@@ -91,29 +91,35 @@ class InvalidSettings(ConsatError, ValueError):
 
 
 class NetworkError(ConsatError):
-    """Agents cannot be put on the network as asked: a library, a port or keys are missing or unfit, or a message cannot be written."""
+    """Agents cannot run on the network as requested: a library, port or key is missing or not usable, or a message cannot be sent."""
 
 
 def closest(name: Any, known: Iterable[str]) -> str:
-    """``; did you mean 'within'?`` if one of the `known` names is close to `name`, else nothing."""
+    """``; did you mean 'within'?`` if one of the `known` names is similar to `name`; else an empty text."""
     by_lower = {each.lower(): each for each in known}
     close = difflib.get_close_matches(str(name)[:100].lower(), by_lower, n=1)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
 
 
 def shown(value: Any) -> str:
-    """The value as errors quote it, cut where it is long."""
+    """The value as error messages quote it, shortened to about 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "…"
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """``1 cluster``, ``2,000 clusters``; `many` is given where it is not `one` with an s."""
+    """A count with its noun: ``1 cluster``, ``2,000 clusters``.
+
+    Args:
+        count: the number.
+        one: the singular.
+        many: the plural; by default `one` with an s.
+    """
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def dotted(path: Iterable[str | int]) -> str:
-    """``("agents", 1, "radius")`` as ``agents[1].radius``."""
+    """A path as text: ``("agents", 1, "radius")`` becomes ``agents[1].radius``."""
     text = ""
     for part in path:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part

@@ -1,4 +1,4 @@
-"""How numbers are held: float64 for the duration of a call, and groups of unequal size as arrays of equal rows."""
+"""Numerical helpers: double precision for the duration of a call, reductions over groups of unequal size, and timing of compilation."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PADDING_LIMIT = 4
-"""Groups are padded to the largest while that costs at most this many times the elements; beyond, and where most groups are empty, they
-are scattered."""
+"""Groups are padded to the size of the largest if that needs at most this many times the elements. Otherwise, and if most groups are
+empty, a scatter is used."""
 UNROLLED = 16
-"""Groups of up to so many are folded element by element, which needs no room for all."""
+"""Groups of up to this many elements are reduced element by element, which avoids a padded array of all elements."""
 
 
 def float64(function: Callable[P, T]) -> Callable[P, T]:
-    """Run `function` with JAX in double precision, and leave the caller's own JAX settings as they were.
+    """Decorator: run `function` with JAX in double precision. The caller's JAX settings are restored afterwards.
 
-    It raises a `consat.ConsatError` in a process in which JAX cannot compute; see `consat.forks`.
+    The function raises a `consat.ConsatError` in a process in which JAX cannot compute; see `consat.forks`.
     """
 
     @functools.wraps(function)
@@ -43,7 +43,7 @@ def float64(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def on_device(value: ArrayLike) -> Array:
-    """The value as a JAX array with memory of its own.
+    """The value as a JAX array with separate memory.
 
     `jnp.asarray` does the same, but compiles a program for each new shape of a numpy array: 20 to 30 ms each on a CPU, dozens at a start.
     """
@@ -51,13 +51,12 @@ def on_device(value: ArrayLike) -> Array:
 
 
 def once(rows: np.ndarray) -> np.ndarray:
-    """(M, …) → (1, …) where all rows are known to be one row in memory, so that what is computed of a million equal rows is computed once;
-    else as it is."""
+    """(M, …) → (1, …) if all rows are the same memory (stride 0); else the array itself. Equal rows are then processed only once."""
     return rows[:1] if len(rows) > 1 and rows.strides[0] == 0 else rows
 
 
 def stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Arrays one after the other; where all rows are equal and each part holds one row in memory, so does the whole."""
+    """Concatenation along axis 0. If each part is one repeated row and these rows are equal, the result is a broadcast of that row."""
     rows = [once(part) for part in parts]
     if all(len(row) == 1 for row in rows) and all(np.array_equal(rows[0], row) for row in rows[1:]):
         return np.broadcast_to(rows[0], (sum(map(len, parts)), *rows[0].shape[1:]))
@@ -65,60 +64,73 @@ def stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def quick_compilation() -> dict[str, bool | int] | None:
-    """Options for programs that take longer to compile than to run: on a CPU they halve the former at no measurable cost to the latter."""
+    """Compiler options for programs that compile longer than they run; None if the backend is not the CPU.
+
+    They halve the compilation time without a measurable effect on the run time.
+    """
     return {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
 
 
 def thorough_compilation() -> dict[str, bool | int | str] | None:
-    """Options for programs that run longer than they compile: on a CPU, so that what does not wait for one another is on all cores at once
-    (by default memory is shared between such parts, which makes them wait), and so that short sums, over the axes of space, are fused with
-    what is around them, not handed to a library."""
+    """Compiler options for programs that run longer than they compile; None if the backend is not the CPU.
+
+    The scheduler runs independent operations concurrently; by default they share memory and wait for each other. Short sums, such as those
+    over the axes of space, are fused with the surrounding operations instead of being passed to a library.
+    """
     if jax.default_backend() != "cpu":
         return None
     return {"xla_cpu_enable_concurrency_optimized_scheduler": True, "xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 FEW = 24
-"""Up to so many terms are added one by one: compilers fuse that with what is around it, but not a sum over an axis."""
+"""Up to this many terms are added one by one. Compilers fuse additions with the surrounding operations, but not a sum over an axis."""
 
 
 def add_up(terms: Array | Sequence[Array]) -> Array:
-    """Σ over the first axis, in order while there are few."""
+    """The sum over axis 0; in order, one term after the other, if there are at most `FEW`."""
     return functools.reduce(operator.add, list(terms)) if 0 < len(terms) <= FEW else jnp.sum(jnp.asarray(terms), axis=0)
 
 
 def pick(elements: Array, index: Array) -> Array:
-    """``elements[index]``, for an index that is known to be in 0 … len − 1: nothing is spent on negative ones."""
+    """``elements[index]`` without bounds checks. All indices must be in 0 … len − 1."""
     return elements.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def taken(elements: Array, index: Array, empty: float) -> Array:
-    """The elements, along their first axis, at an index that is padded with their number; `empty` there."""
+    """``elements[index]`` along axis 0. Where the index is ``len(elements)``, which marks padding, the result is `empty`."""
     last = len(elements) - 1
     there = (index <= last).reshape(*index.shape, *[1] * (elements.ndim - 1))
-    return jnp.where(there, pick(elements, jnp.minimum(index, last)), empty)  # a copy with a filler behind it would cost as much again
+    return jnp.where(there, pick(elements, jnp.minimum(index, last)), empty)  # appending a filler element would copy all elements
 
 
 def laid_out(values: Mapping[str, Array], members: Array) -> dict[str, Array]:
-    """Parameters of a family, (M_f, …) each, as a batch holds them: (chunks, m, …, A) for members (chunks, m, A)."""
+    """Parameters of a family in the layout of a batch.
+
+    Args:
+        values: parameters, each (M_f, …).
+        members: (chunks, m, A) indices of the constraints.
+
+    Returns:
+        parameters, each (chunks, m, …, A).
+    """
     return {key: jnp.moveaxis(pick(jnp.asarray(array), members), 2, -1) for key, array in values.items()}
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Groups:
-    """Elements that belong to groups: constraints to agents, gradients to rows, links to rows.
+    """Assignment of elements to groups (constraints to agents, gradients to rows, links to rows), with reductions over the groups.
 
-    Sums and maxima over the groups are a reshape where all groups are alike, else a gather through a padded index, else,
-    for very uneven groups such as the hub of a star, a sorted scatter.
+    The reductions use a reshape if all groups have the same size and the elements are in order. Otherwise they gather through a padded
+    index. For very uneven groups, such as the hub of a star, they use a sorted scatter.
 
     Attributes:
-        group: (E,) the group of each element.
-        index: (width, G) the elements of each group, padded with E; or (E,) elements in the order of their groups; or None when
-            the elements lie in order and all groups have the same size.
-        count: G.
+        group: (E,) group of each element.
+        index: (width, G) elements of each group, padded with E; or (E,) elements sorted by group, if `padded` is false; or None if the
+            elements are in order and all groups have the same size.
+        count: G, the number of groups.
         width: size of the largest group.
-        padded: whether `index` is the padded form.
+        padded: false if `index` holds the elements sorted by group.
     """
 
     group: Array
@@ -129,7 +141,12 @@ class Groups:
 
     @classmethod
     def of(cls, group: np.ndarray, count: int) -> Groups:
-        """Args: group: (E,) int, the group of each element; count: how many groups there are."""
+        """Choose the representation.
+
+        Args:
+            group: (E,) int, group of each element.
+            count: G, the number of groups.
+        """
         group = np.asarray(group, dtype=np.int32)
         device = on_device(group)
         sizes = np.bincount(group, minlength=count)
@@ -146,17 +163,17 @@ class Groups:
         return cls(device, on_device(index), count, width, padded=True)
 
     def spread(self, values: Array) -> Array:
-        """(G, …) → (E, …): to each element the value of its group."""
+        """(G, …) → (E, …): for each element the value of its group."""
         if self.index is None:
             return values if self.width == 1 else jnp.repeat(values, self.width, axis=0, total_repeat_length=self.count * self.width)
         return pick(values, self.group)
 
     def sum(self, elements: Array) -> Array:
-        """(E, …) → (G, …): the sum over each group, 0 for an empty one."""
+        """(E, …) → (G, …): sum over each group; 0 for an empty group."""
         return self._folded(elements, _SUM)
 
     def max(self, elements: Array) -> Array:
-        """(E, …) → (G, …): the maximum over each group, −∞ for an empty one."""
+        """(E, …) → (G, …): maximum over each group; −∞ for an empty group."""
         return self._folded(elements, _MAX)
 
     def _folded(self, elements: Array, fold: _Fold) -> Array:
@@ -174,8 +191,10 @@ class Groups:
         return functools.reduce(fold.two, list(parts)) if self.width <= UNROLLED else fold.axis(parts, axis=0)
 
     def logsumexp(self, elements: Array) -> tuple[Array, Array]:
-        """(E,) → (G,) and (E,): log Σ exp over each group, −∞ for an empty one, and the softmax weights within the group. Where elements
-        are +∞, so is the sum, and they share the weight."""
+        """(E,) → (G,) log Σ exp over each group, −∞ for an empty group; and (E,) softmax weights within each group.
+
+        If elements of a group are +∞, so is its sum, and they share the weight equally.
+        """
         if self.width <= 1 and self.padded:
             return self.max(elements), jnp.ones_like(elements)
         top = jax.lax.stop_gradient(self.max(elements))
@@ -188,7 +207,7 @@ class Groups:
 
 
 def softmax(elements: Array) -> Array:
-    """(E,) weights that sum to 1, as `jax.nn.softmax`; elements that are +∞ share them."""
+    """(E,) weights that sum to 1, as `jax.nn.softmax`. Elements that are +∞ share the weight equally."""
     top = jnp.max(elements, initial=-jnp.inf)
     powers = _powers(elements, jnp.where(jnp.isfinite(top), top, 0.0), top)
     total = jnp.sum(powers)
@@ -196,13 +215,20 @@ def softmax(elements: Array) -> Array:
 
 
 def _powers(elements: Array, shift: Array, top: Array) -> Array:
-    """e^(elements − shift); where the largest, `top`, is +∞, 1 for those that are it and 0 for the others."""
+    """e^(elements − shift). If the largest element, `top`, is +∞: 1 for infinite elements and 0 for the others."""
     unlimited = top == jnp.inf
     return jnp.where(unlimited, (elements == jnp.inf).astype(elements.dtype), jnp.exp(jnp.where(unlimited, 0.0, elements - shift)))
 
 
 class _Fold(NamedTuple):
-    """What two elements, an axis of them, and sorted groups of them fold to, and what none do."""
+    """One reduction in several forms.
+
+    Attributes:
+        two: reduces two arrays element by element.
+        axis: reduces along an axis.
+        sorted: reduces segments of elements that are sorted by group.
+        empty: result for an empty group.
+    """
 
     two: Callable[[Any, Any], Any]
     axis: Callable[..., Array]
@@ -215,7 +241,11 @@ _MAX = _Fold(jnp.maximum, jnp.max, jax.ops.segment_max, -jnp.inf)
 
 
 class CompileClock:
-    """Tells, within a `with` block, the seconds that JAX spent tracing and compiling from those spent running."""
+    """Context manager that measures the time of its block, s, and separates JAX tracing and compilation from the rest.
+
+    Attributes:
+        seconds: ``compile`` and ``run``, set when the block ends.
+    """
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
@@ -235,7 +265,7 @@ class CompileClock:
         jax.monitoring.unregister_event_time_span_listener(self._hear)
         total = time.perf_counter() - self._begin
         compile_, reached = 0.0, -np.inf
-        for start, end in sorted(self._spans):  # traces nest, so their spans overlap
+        for start, end in sorted(self._spans):  # traces may be nested, so their spans overlap
             compile_ += max(0.0, end - max(start, reached))
             reached = max(reached, end)
         self.seconds.update(compile=compile_, run=max(total - compile_, 0.0))

@@ -1,4 +1,4 @@
-"""How a team is run: start, protocol, smoothing, stop. The same models are the schema of these keys in a scenario file."""
+"""Settings of a run: start, protocol, smoothing. These pydantic models also validate the same keys of a scenario file."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ Seed = Annotated[int, Field(ge=0, lt=2**63), BeforeValidator(_no_boolean)]
 
 
 def _rule(message: str) -> PydanticCustomError:
-    """An error whose message needs no rewriting: it says what is wrong and what would be right."""
+    """An error whose message is shown unchanged. It says what is wrong and what would be right."""
     return PydanticCustomError("rule", "{message}", {"message": message})
 
 
 class Model(BaseModel):
-    """Frozen, and says so when a key is unknown. The description of a field says what it must be; errors quote it."""
+    """Base of the settings: frozen, and unknown keys are errors. Error messages quote the description of a field."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
 
 class Ramp(Model):
-    """ν_β(t) = min(from + rate·t, to): the paper's cure for overflow at the start (section IV-F).
+    """Ramp of the smoothing: ν_β(t) = min(from + rate·t, to). It prevents overflow at the start (paper, section IV-F).
 
     Attributes:
-        start: ν_β(0), written ``from`` in a file; 1/ψ.
-        to: its final value, 1/ψ.
-        rate: 1/(ψ s).
+        start: ν_β(0), in units of 1/ψ; the key in a file is ``from``.
+        to: final ν_β, in units of 1/ψ, at least `start`.
+        rate: increase of ν_β, in units of 1/(ψ s).
     """
 
     start: Gain = Field(alias="from", description="a positive number")
@@ -55,18 +55,19 @@ class Ramp(Model):
 
 
 class Smoothing(Model):
-    """ν_α and ν_β of the soft minima (paper, eq. 7 and 9), in units of 1/ψ."""
+    """ν_α and ν_β of the smooth minima (paper, eq. 7 and 9), in units of 1/ψ."""
 
     nu_alpha: Gain = Field(description="a positive number")
     nu_beta: Gain | Ramp = Field(description="a positive number, or a ramp such as {from: 0.01, to: 5, rate: 0.022}")
 
 
 class Start(Model):
-    """Where starts and first estimates are drawn, if not given.
+    """The box in which start positions and first estimates are drawn, if not given.
 
     Attributes:
-        box: ``[low, high]``, numbers for all axes alike or one list each; None lets the scale of the constraints decide.
-        seed: of the draw.
+        box: ``[low, high]``, length: two numbers for all axes, or two lists with a number per axis. If None, the scale of the constraints
+            decides; see `consat.problem.units.start_box`.
+        seed: seed of the random draw.
     """
 
     box: Box | None = Field(None, description="[low, high] with low ≤ high: two numbers, or two lists of numbers")
@@ -87,14 +88,14 @@ ProtocolKind = Literal["interior-point", "gradient-flow", "proportional-integral
 
 
 class ProtocolSettings(Model):
-    """Which protocol, over which estimates, with which gains.
+    """The protocol, its estimates and its gains.
 
     Attributes:
-        kind: its name; None for the default.
-        estimates: who holds copies: ``local`` what is needed, ``full`` everything (the paper).
+        kind: name of the protocol; None for the default.
+        estimates: which positions an agent holds estimates of: ``local`` those that it needs, ``full`` all (as in the paper).
         k1: gain of a flow on the gradient.
-        k2: gain of a flow on the disagreement.
-        penalty: ρ of admm at the start, in 1/length², the team's unit.
+        k2: gain of a flow on the disagreement between estimates.
+        penalty: initial ρ of admm, in 1/length².
         relaxation: a of admm, between 0 and 1.
         step: c of proximal, in length².
     """
@@ -109,7 +110,7 @@ class ProtocolSettings(Model):
 
 
 class Settings(Model):
-    """All of it, with the defaults that apply where nobody says otherwise."""
+    """All settings of a run, with their defaults."""
 
     start: Start = Field(Start(), description="a mapping such as {box: [-4, 4], seed: 0}")
     protocol: ProtocolSettings = Field(ProtocolSettings(), description="a mapping such as {kind: admm, estimates: local}")
