@@ -1,4 +1,4 @@
-"""What an agent needs of a network: to send bytes to its neighbours, and to find what they sent. All else may go wrong on the way."""
+"""`Transport`: the interface of an agent to the network. It sends bytes to neighbours and returns the bytes that they sent."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from typing import Protocol
 
 
 class Transport(Protocol):
-    """An agent's own end of the links to its neighbours. What is sent may be lost, late, repeated or in disorder."""
+    """The links of one agent to its neighbours. Messages may be lost, delayed, duplicated or reordered."""
 
     def send(self, neighbour: str, payload: bytes) -> None:
-        """Hand over a message and go on; never waits for it to arrive."""
+        """Send a message. Does not wait for delivery."""
         ...
 
     def receive(self) -> list[bytes]:
-        """All that has arrived since the last call, whoever sent it; never waits. The queue is bounded: the oldest are dropped."""
+        """All messages from all neighbours since the last call. Does not wait. The queue is bounded; the oldest messages are dropped."""
         ...
 
     def wait(self, timeout: float) -> bool:
-        """Wait until something has arrived, but no longer than `timeout` in s; whether something has."""
+        """Wait until a message has arrived, at most `timeout`, s. Returns whether one has."""
         ...
 
     def alive(self) -> frozenset[str]:
-        """The neighbours that are up, as far as the network can tell."""
+        """The neighbours that are up, as far as the network knows."""
         ...
 
     def close(self) -> None:
-        """Leave; the neighbours see it."""
+        """Close the links. The neighbours see that this agent is down."""
         ...

@@ -1,4 +1,4 @@
-"""Bad weather: what arrives over another transport is lost or late, as drawn from a seed. For trials over a network that works."""
+"""Wraps a transport with seeded loss and delay of incoming messages, for experiments on a network that works."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from consat.network.transports import Transport
 
 
 class Weathered:
-    """Another transport, behind bad weather.
+    """A transport that loses and delays the messages that arrive over another one.
 
     Args:
-        inner: the transport.
-        clock: own, s.
-        loss: probability that a message that arrives is lost.
-        delay: (low, high) between which each is held back, s, so that they also come in disorder.
-        seed: of the draws.
+        inner: the wrapped transport.
+        clock: clock of this agent, s.
+        loss: probability that an incoming message is dropped.
+        delay: (low, high) range of the random delay of each message, s. Different delays also reorder messages.
+        seed: seed of the random draws.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A network in memory, on a clock of its own: the same seed gives the same run, to the last bit. For tests and rehearsals."""
+"""A simulated network in memory with a simulated clock. The same seed gives the same run, bit for bit. For tests and rehearsals."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy as np
 from consat.network.transports import Transport
 
 QUEUE = 4096
-"""An agent that does not fetch its messages keeps so many, the newest."""
+"""Largest number of messages that wait for an agent; the oldest are dropped."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What happens to messages on the way.
+    """Faults of the simulated network.
 
     Attributes:
-        loss: probability that one is lost.
-        delay: (low, high) how long one takes, s; as each draws its own, they come in disorder.
-        repeat: probability that one comes twice.
+        loss: probability that a message is lost.
+        delay: (low, high) range of the random delay of each message, s. Different delays also reorder messages.
+        repeat: probability that a message is duplicated.
     """
 
     loss: float = 0.0
@@ -32,11 +32,14 @@ class Conditions:
 
 
 class Air:
-    """Through which all messages go.
+    """The simulated network that carries the messages of all agents.
 
     Args:
-        conditions: what happens to them.
-        seed: of the draws.
+        conditions: faults of the network; by default only a constant delay.
+        seed: seed of the random draws.
+
+    Attributes:
+        now: simulated time, s; the owner of the network advances it.
     """
 
     def __init__(self, conditions: Conditions | None = None, seed: int = 0) -> None:
@@ -49,24 +52,29 @@ class Air:
         self._parts: tuple[frozenset[str], ...] = ()
 
     def clock(self) -> float:
-        """Now, s."""
+        """The simulated time, s."""
         return self.now
 
     def partition(self, *parts: Collection[str]) -> None:
-        """From now on nothing passes between agents of different parts; without arguments, everything does again."""
+        """Block messages between agents of different parts from now on. Without arguments, remove the partition."""
         self._parts = tuple(map(frozenset, parts))
 
     def endpoint(self, me: str, neighbours: Iterable[str]) -> Transport:
-        """The transport of one agent, in place of any that it had."""
+        """A new transport for an agent, which replaces any earlier one.
+
+        Args:
+            me: id of the agent.
+            neighbours: ids of its neighbours.
+        """
         self._open[me] = _Endpoint(self, me, frozenset(neighbours))
         return self._open[me]
 
     def next(self) -> float:
-        """When the next message arrives; ∞ if none is on its way."""
+        """The time at which the next message arrives, s; ∞ if none is under way."""
         return self._flying[0][0] if self._flying else np.inf
 
     def deliver(self) -> set[str]:
-        """Hand over the messages that have arrived by now; to whom."""
+        """Deliver the messages that are due at `now`. Returns the ids of the agents that received any."""
         reached = set()
         while self._flying and self._flying[0][0] <= self.now:
             _, _, to, payload = heapq.heappop(self._flying)
@@ -76,28 +84,28 @@ class Air:
         return reached
 
     def apart(self, a: str, b: str) -> bool:
-        """Whether a partition lies between two agents."""
+        """Whether a partition separates two agents."""
         return any((a in part) != (b in part) for part in self._parts)
 
     def up(self, agent: str) -> bool:
-        """Whether an agent has an endpoint."""
+        """Whether an agent has an open endpoint."""
         return agent in self._open
 
     def post(self, source: str, to: str, payload: bytes) -> None:
-        """Send a message on its way."""
+        """Send a message from `source` to `to`, subject to loss, delay, duplication and partitions."""
         conditions = self.conditions
         for _ in range(1 + (self._random.random() < conditions.repeat)):
             if self._random.random() >= conditions.loss and not self.apart(source, to):
                 heapq.heappush(self._flying, (self.now + self._random.uniform(*conditions.delay), next(self._order), to, payload))
 
     def close(self, agent: str, endpoint: _Endpoint | None = None) -> None:
-        """Take an agent off the air, as a crash does; or a certain endpoint of it, if it still has that."""
+        """Close the endpoint of an agent, as a crash does. If `endpoint` is given, only if it is still the agent's current one."""
         if endpoint is None or self._open.get(agent) is endpoint:
             self._open.pop(agent, None)
 
 
 class _Endpoint:
-    """`Transport` of one agent."""
+    """The `Transport` of one agent on the simulated network."""
 
     def __init__(self, air: Air, me: str, neighbours: frozenset[str]) -> None:
         self._air, self._me, self._neighbours = air, me, neighbours
@@ -113,7 +121,7 @@ class _Endpoint:
         return found
 
     def wait(self, timeout: float) -> bool:
-        """Time does not pass by waiting here: whoever moves the clock calls the agent when something has come."""
+        """Whether messages have arrived. Returns at once, because waiting does not advance the simulated clock."""
         return bool(self.queue)
 
     def alive(self) -> frozenset[str]:

@@ -1,7 +1,7 @@
-"""Agents over eclipse-zenoh: peers that connect to their neighbours and to nobody else, and relay nothing.
+"""Transport over eclipse-zenoh. Agents are peers that connect to their neighbours only and relay nothing.
 
-An agent writes to ``consat/<run>/v1/e/<itself>/<neighbour>`` and shows that it is up at ``consat/<run>/v1/live/<itself>``. With credentials
-every link is TLS with both ends' certificates checked, and a neighbour may do only what the names in those keys say: see docs/security.md.
+An agent publishes to ``consat/<run>/v1/e/<itself>/<neighbour>`` and shows that it is up with the token ``consat/<run>/v1/live/<itself>``.
+With credentials, each link is mutual TLS, and access control restricts a neighbour to the keys that contain its name: see docs/security.md.
 """
 
 from __future__ import annotations
@@ -25,27 +25,28 @@ if TYPE_CHECKING:
     from consat.network.keys import Credentials
 
 LEASE: Final = 1000
-"""Milliseconds of silence after which a link is given up; zenoh keeps it alive four times as often."""
+"""Silence after which a link is closed, ms. Zenoh sends four keep-alive messages in this time."""
 MOST_MESSAGES: Final = 256
+"""Largest number of messages from one neighbour that wait to be read; the oldest are dropped."""
 MOST_BYTES: Final = 2**23
-"""What waits from one neighbour at most; the oldest are dropped."""
+"""Largest total size of these messages, bytes; the oldest are dropped."""
 
 
 def connect(
     run: str, me: str, listen: str, neighbours: Mapping[str, str], *, reliable: bool = False, credentials: Credentials | None = None
 ) -> Transport:
-    """An agent's links to its neighbours. Returns at once; who isn't there yet is tried again for ever.
+    """Open the links of an agent to its neighbours. Returns at once; connections are retried without end.
 
     Args:
-        run: which run; agents of other runs are not heard.
-        me: this agent.
-        listen: where it can be reached, e.g. ``tcp/127.0.0.1:7447``; ``tls/…`` with credentials.
-        neighbours: the same of each neighbour.
-        reliable: a message that finds its queue full waits, rather than being dropped.
-        credentials: for mutual TLS and access control; without, whoever reaches the port can say anything.
+        run: id of the run. Agents of other runs are not heard.
+        me: id of this agent.
+        listen: address at which this agent listens, e.g. ``tcp/127.0.0.1:7447``; ``tls/…`` with credentials.
+        neighbours: address of each neighbour, by id.
+        reliable: whether sending waits if the queue is full. Otherwise the message is dropped.
+        credentials: for mutual TLS and access control. If None, anybody who reaches the port can send messages.
 
     Raises:
-        NetworkError: the library is missing, the port is taken, or the credentials are unfit.
+        NetworkError: the library is missing, the port is in use, an address does not fit the credentials, or a key file is missing.
     """
     try:
         import zenoh
@@ -55,8 +56,8 @@ def connect(
         if endpoint.startswith("tls/") != (credentials is not None):
             raise NetworkError(f"with keys every address must begin with tls/, without keys none may, but one is {endpoint!r}")
     config = zenoh.Config()
-    # Of two neighbours one connects: were it both, a link that is made anew while one end still holds the old one could become a second
-    # link of the old session there, which then never tells the other end again that it is up and what it listens to.
+    # Only one of two neighbours connects. If both did, a new link could be added to an old session that the other end still holds, and
+    # that session would never declare its token and subscriptions again.
     settings = _settings(listen, [endpoint for neighbour, endpoint in neighbours.items() if spelled(neighbour) < spelled(me)])
     if credentials is not None:
         for path in (credentials.ca, credentials.certificate, credentials.key):
@@ -77,7 +78,7 @@ def connect(
 
 
 def _words(error: Exception) -> str:
-    """What zenoh says, without the places in its source."""
+    """The message of a zenoh error, without locations in zenoh's source code."""
     return re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
 
 
@@ -90,7 +91,7 @@ def _token(run: str, agent: str) -> str:
 
 
 def _settings(listen: str, connect: Sequence[str]) -> dict[str, Any]:
-    """Peers connect where they are told to, find nobody by themselves, and never give up."""
+    """Zenoh settings: connect only to the given endpoints, without discovery, and retry without end."""
     return {
         "mode": "peer",
         "listen/endpoints": [listen],
@@ -104,10 +105,10 @@ def _settings(listen: str, connect: Sequence[str]) -> dict[str, Any]:
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         "adminspace/enabled": False,
         "transport/link/tx/lease": LEASE,
-        # A neighbour that hangs must not hold up the others' messages for longer than it takes to notice.
+        # A neighbour that hangs must not block messages to the others for longer than the lease.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1000 * LEASE,
         "transport/link/rx/max_message_size": 2 * wire.LONGEST,
-        # TLS does not cover what neighbours on one machine would pass through shared memory.
+        # Shared memory between neighbours on one machine would bypass TLS.
         "transport/shared_memory/enabled": False,
     }
 
@@ -130,7 +131,7 @@ def _protection(credentials: Credentials) -> dict[str, Any]:
 
 
 def _access(run: str, me: str, neighbours: Mapping[str, str]) -> dict[str, Any]:
-    """What passes over the link to each neighbour, told by the common name of its certificate; nothing else does, nor to anybody else."""
+    """Access control: the messages allowed on the link to each neighbour, by the common name of its certificate. All else is denied."""
     rules: list[dict[str, Any]] = []
     policies = []
     for number, neighbour in enumerate(neighbours):
@@ -152,7 +153,15 @@ def _access(run: str, me: str, neighbours: Mapping[str, str]) -> dict[str, Any]:
 
 
 class Inbox:
-    """What has come from one neighbour and waits to be read: bounded in number and bytes, the oldest go first. For two threads."""
+    """Queue of the messages from one neighbour. Bounded in number and bytes: the oldest are dropped. Thread-safe.
+
+    Args:
+        most: largest number of messages.
+        most_bytes: largest total size, bytes.
+
+    Attributes:
+        dropped: number of messages dropped so far.
+    """
 
     def __init__(self, most: int = MOST_MESSAGES, most_bytes: int = MOST_BYTES) -> None:
         self.dropped = 0
@@ -163,7 +172,7 @@ class Inbox:
         self._lock = threading.Lock()
 
     def put(self, payload: bytes) -> None:
-        """Append it."""
+        """Append a message."""
         with self._lock:
             self._waiting.append(payload)
             self._bytes += len(payload)
@@ -172,7 +181,7 @@ class Inbox:
                 self.dropped += 1
 
     def take(self) -> list[bytes]:
-        """All of it."""
+        """Remove and return all messages, the oldest first."""
         with self._lock:
             taken = list(self._waiting)
             self._waiting.clear()
@@ -181,13 +190,13 @@ class Inbox:
 
 
 class _Zenoh:
-    """`Transport` on an open session."""
+    """The `Transport` of one agent on an open zenoh session."""
 
     def __init__(self, session: zenoh.Session, run: str, me: str, neighbours: Mapping[str, str], reliable: bool) -> None:
         import zenoh
 
         self.misnamed: Counter[str] = Counter()
-        """Per neighbour, messages that it signed with another's name."""
+        """Number of messages, by neighbour, whose sender field names another agent."""
         self._error = zenoh.ZError
         self._session = session
         self._arrived = threading.Event()
@@ -199,11 +208,11 @@ class _Zenoh:
             for neighbour in neighbours
         }
         for neighbour, inbox in self._inboxes.items():
-            # These run on zenoh's threads.
+            # The callbacks run in zenoh's threads.
             session.declare_subscriber(_key(run, neighbour, me), functools.partial(self._put, inbox))
             show = functools.partial(self._show, neighbour, zenoh.SampleKind.PUT)
             session.liveliness().declare_subscriber(_token(run, neighbour), show, history=True)
-        self._token = session.liveliness().declare_token(_token(run, me))  # it lasts as long as this object
+        self._token = session.liveliness().declare_token(_token(run, me))  # valid as long as this reference is kept
 
     def send(self, neighbour: str, payload: bytes) -> None:
         try:
@@ -212,7 +221,7 @@ class _Zenoh:
             raise NetworkError(f"cannot send to {neighbour!r}: {_words(error)}") from None
 
     def receive(self) -> list[bytes]:
-        self._arrived.clear()  # before looking, so that what comes while we look wakes the next `wait`
+        self._arrived.clear()  # clear first, so that a message that arrives meanwhile wakes the next `wait`
         received = []
         for neighbour, inbox in self._inboxes.items():
             for payload in inbox.take():
