@@ -1,1 +1,1 @@
-"""Processes: an agent's own (`process`), a whole team's on this machine (`launch`), and who watches them (`observer`, `dashboard`)."""
+"""Agents as processes: one agent (`process`), a whole team on this machine (`launch`), and their observation (`observer`, `dashboard`)."""

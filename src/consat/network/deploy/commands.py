@@ -1,6 +1,7 @@
-"""Timed changes of a team that runs: a file of commands, all of it checked before anything starts.
+"""Command files: timed changes of a running team. All commands are checked before the launch starts.
 
-It is a YAML list of mappings, or JSON, one object a line: ``{"at": 2.0, "agent": "a1", "command": "change", "constraint": "goal", …}``.
+The file is a YAML list of mappings, or JSON with one object per line:
+``{"at": 2.0, "agent": "a1", "command": "change", "constraint": "goal", …}``.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from consat.scenario.document import Document, Node, decode, read
 COMMANDS: Final[dict[str, tuple[str, ...]]] = {
     "change": ("agent", "constraint"), "leave": ("agent",), "join": ("agent",), "connect": ("agents",), "disconnect": ("agents",),
 }  # fmt: skip
-"""And which keys each must have besides `at`; a change has parameters besides, the others no more."""
+"""The commands, and the keys that each requires besides ``at``. Only ``change`` has further keys: the parameters."""
 RELINK: Final = ("connect", "disconnect")
 
 
 class Stage(NamedTuple):
-    """How a team stands between two commands.
+    """State of a team between two commands.
 
     Attributes:
-        since: s since t = 0.
-        team: all agents that there ever are, with their constraints and links as they are.
-        present: who is there.
+        since: start of this state, s since t = 0.
+        team: all agents, present or absent, with their current constraints and links.
+        present: ids of the agents that are present.
     """
 
     since: float
@@ -40,7 +41,7 @@ class Stage(NamedTuple):
     present: frozenset[str]
 
     def there(self) -> tuple[Team, np.ndarray]:
-        """The team of those who are there, and their places in the whole."""
+        """The team of the agents that are present, and their indices in `team`."""
         places = np.array([i for i, agent in enumerate(self.team.ids) if agent in self.present])
         return (self.team, places) if len(places) == self.team.count else (self.team.part(places)[0], places)
 
@@ -50,12 +51,12 @@ class Timed:
     """One command.
 
     Attributes:
-        at: s since t = 0.
-        command: see `COMMANDS`.
-        agents: whom it is about.
-        constraint: of a change.
-        parameters: of a change, as a scenario has them.
-        after: how the team stands then.
+        at: time of the command, s since t = 0.
+        command: one of `COMMANDS`.
+        agents: ids of the agents concerned: one, or the two ends of a link.
+        constraint: name of the constraint of a ``change``; else empty.
+        parameters: new parameters of a ``change``, written as in a scenario.
+        after: state of the team after the command.
     """
 
     at: float
@@ -67,19 +68,24 @@ class Timed:
 
 
 class Script(NamedTuple):
-    """Commands in the order of their times, and how the team stands at the beginning: whose first command is to join is not there."""
+    """The commands of a launch.
+
+    Attributes:
+        begin: state of the team at the beginning. An agent whose first command is ``join`` is absent.
+        commands: the commands, sorted by time.
+    """
 
     begin: Stage
     commands: tuple[Timed, ...]
 
     @property
     def stages(self) -> list[Stage]:
-        """One after the other."""
+        """All states of the team, in order of time."""
         return [self.begin, *(each.after for each in self.commands)]
 
 
 def no_commands(team: Team) -> Script:
-    """Nothing changes."""
+    """A script without commands."""
     return Script(Stage(0.0, team, frozenset(team.ids)), ())
 
 
@@ -87,20 +93,28 @@ def load_commands(file: Path, team: Team, mode: str, until: float | None) -> Scr
     """Read a file of commands for a team.
 
     Args:
-        file: YAML or JSON lines.
-        team: as it is at the beginning.
-        mode: how its agents talk.
-        until: when the launch ends, s, if that is known.
+        file: path of the file, YAML or JSON lines.
+        team: all agents, with their constraints and links at the beginning.
+        mode: communication mode of the agents.
+        until: end of the launch, s; None if not known.
 
     Raises:
-        InvalidScenario: names every fault with its line and column.
+        InvalidScenario: the file has faults. The message names every fault with its line and column.
         OSError: the file cannot be read.
     """
     return read_commands(decode(file.read_bytes(), str(file)), str(file), team, mode, until)
 
 
 def read_commands(text: str, file: str, team: Team, mode: str, until: float | None = None) -> Script:
-    """See `load_commands`."""
+    """As `load_commands`, from the text of a file.
+
+    Args:
+        text: YAML or JSON lines.
+        file: name of the file, for messages.
+        team: as in `load_commands`.
+        mode: as in `load_commands`.
+        until: as in `load_commands`.
+    """
     document = _document(text, file)
     entries = document.root.plain if document.root else []
     if not isinstance(entries, list):
@@ -131,7 +145,7 @@ def read_commands(text: str, file: str, team: Team, mode: str, until: float | No
 
 
 def _document(text: str, file: str) -> Document:
-    """A list, of lines of JSON or of YAML."""
+    """The parsed file. JSON lines become one list, with the line numbers of the file."""
     if not text.lstrip().startswith("{"):
         return read(text, file)
     nodes, faults = [], []
@@ -144,7 +158,7 @@ def _document(text: str, file: str) -> Document:
 
 
 def _faults(k: int, entry: Any, team: Team, mode: str, until: float | None) -> Iterator[Fault]:
-    """What is wrong with an entry by itself."""
+    """Faults of a single entry, without regard to the state of the team."""
     where = f"command {k + 1}"
     if not isinstance(entry, dict):
         yield Fault((k,), f"it is {shown(entry)}, but must be a mapping such as {{at: 2, agent: a1, command: leave}}", where)
@@ -187,7 +201,7 @@ def _unknown(k: int, entry: Mapping[str, Any], command: str, team: Team, where: 
 
 
 def _after(stage: Stage, entry: Mapping[str, Any]) -> Timed:
-    """The command, and how the team stands after it. Raises: InvalidTeam: it cannot be carried out there."""
+    """The command with the state of the team after it. Raises: InvalidTeam: it cannot be carried out in the given state."""
     at, command = float(entry["at"]), entry["command"]
     given = {key: value for key, value in entry.items() if key not in ("at", "command", *COMMANDS[command])}
     if command in RELINK:
@@ -222,7 +236,7 @@ def _relinked(stage: Stage, command: str, agents: tuple[str, ...]) -> Team:
 
 
 def _require_connected(stage: Stage, key: str, where: str) -> None:
-    """Raises: InvalidTeam: agents that depend on each other could not reach one another."""
+    """Raises: InvalidTeam: a cluster of the present agents would not be connected by links."""
     try:
         require_connected(stage.there()[0])
     except InvalidTeam as error:

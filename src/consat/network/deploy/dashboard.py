@@ -1,4 +1,4 @@
-"""The team in the terminal while it runs: a row an agent, with its margin, its rate, its links, and whether it is up."""
+"""Live terminal dashboard: one row per agent with its state, margin, rate and links."""
 
 from __future__ import annotations
 
@@ -21,7 +21,15 @@ _KNOWN: Final = {
 
 @contextmanager
 def board(title: str, *, quiet: bool) -> Iterator[Callable[[Observer, Mapping[str, bool], float], None]]:
-    """Draws a table on stderr, where that is a terminal: of what an observer knows, who runs, and the seconds since the start."""
+    """Context manager for a live table on stderr; it draws nothing if `quiet` or if stderr is not a terminal.
+
+    Args:
+        title: title of the table.
+        quiet: whether to draw nothing.
+
+    Yields:
+        a function that redraws the table from the observer, whether each agent's process runs, and the time since the start, s.
+    """
     import sys
 
     if quiet or not sys.stderr.isatty():
@@ -35,7 +43,14 @@ def board(title: str, *, quiet: bool) -> Iterator[Callable[[Observer, Mapping[st
 
 
 def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: float) -> Table:
-    """Drawn with rich."""
+    """The table, as a rich renderable.
+
+    Args:
+        title: title of the table.
+        observer: what the agents have reported.
+        running: whether the process of each agent runs, by id.
+        seconds: time since the start, s.
+    """
     from rich.table import Table
     from rich.text import Text
 
@@ -72,5 +87,5 @@ def _state(seen: Seen, *, up: bool) -> str:
 
 
 def _rate(seen: Seen) -> float:
-    """Turns a second, over the last report."""
+    """Turns per second in the last report; reports come every 0.1 s."""
     return len(seen.report["track"]) / 0.1 if seen.report else 0.0

@@ -1,4 +1,4 @@
-"""What the environment of an agent's process must hold before JAX starts: one thread, and compiled programs kept between runs."""
+"""Environment variables of an agent's process, set before JAX starts: one thread, and a cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Final
 
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOG_LEVEL, _OF_JAX = "TF_CPP_MIN_LOG_LEVEL", "1"
-"""What XLA writes on stderr, and what JAX asks for where nobody does, which its subprocesses inherit."""
+"""XLA's log level, and the default that JAX sets for itself, which subprocesses inherit."""
 ONE_THREAD: Final = "--xla_cpu_multi_thread_eigen=false"
 ROUND_EACH: Final = "--xla_cpu_max_isa=AVX"
-"""Without fused multiply-add every product is rounded by itself, so that a result does not depend on what XLA computes beside it."""
+"""Disables fused multiply-add, so each product is rounded. The bits of a result then do not depend on how XLA fuses operations."""
 
 
 def prepare(environment: MutableMapping[str, str], *, exact: bool) -> None:
-    """Fill in what nobody has set.
+    """Set the variables that are not set yet.
 
     Args:
-        environment: `os.environ`, or that of a process to be started.
-        exact: whether an agent is to get the same bits as one process that computes the whole team.
+        environment: `os.environ`, or the environment of a process to be started.
+        exact: whether results must be bit-identical to those of one process that computes the whole team.
     """
     for name in _THREADS:
         environment.setdefault(name, "1")
@@ -35,16 +35,16 @@ def prepare(environment: MutableMapping[str, str], *, exact: bool) -> None:
 
 
 def prepare_own(*, exact: bool) -> None:
-    """The same for this process."""
+    """As `prepare`, for the environment of this process."""
     prepare(os.environ, exact=exact)
 
 
 def keep_compilations(environment: MutableMapping[str, str]) -> None:
-    """Keep compiled programs between runs, in the user's own cache directory, unless somebody has said where."""
+    """Enable JAX's cache of compiled programs, in the user's cache directory unless another directory is set."""
     if "JAX_COMPILATION_CACHE_DIR" not in environment:
         home = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         environment["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
     if environment.get(_LOG_LEVEL, _OF_JAX) == _OF_JAX:
-        environment[_LOG_LEVEL] = "3"  # XLA calls every program that it takes from there one of another machine, in 2 KiB on stderr
+        environment[_LOG_LEVEL] = "3"  # for each cached program, XLA would log a false warning of 2 KiB about another machine
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

@@ -1,4 +1,4 @@
-"""The processes of a team on this machine: started, listened to, and ended by their handles."""
+"""The processes of a team on this machine: starts them, reads their events, and ends them."""
 
 from __future__ import annotations
 
@@ -23,18 +23,23 @@ from consat.network.names import spelled
 from consat.network.node.part import Part, write_part
 
 PATIENCE: Final = 3.0
-"""An agent told to stop has so long, s, before it is ended."""
+"""Time that an agent has to stop by itself before it is terminated, s."""
 LARGEST_READ: Final = 2**20
 
 PORTS: Final = (10240, 32768)
-"""Among which a team's are chosen."""
+"""Range of the ports of a team; the upper end is excluded."""
 
 Event = Mapping[str, Any]
 
 
 @dataclass
 class _Child:
-    """The process of one agent, and what it has written of a line so far."""
+    """The process of one agent.
+
+    Attributes:
+        process: the process.
+        rest: the last, incomplete line of its output.
+    """
 
     process: subprocess.Popen[bytes]
     rest: bytes = b""
@@ -42,11 +47,11 @@ class _Child:
 
 @dataclass(frozen=True)
 class Fleet:
-    """The processes of a team; leaving its `with` block ends those that still run.
+    """The processes of a team. A context manager; at the end of the block, processes that still run are killed.
 
     Args:
-        parts: by agent.
-        options: of ``consat agent``, the same for all.
+        parts: the part (local problem) of each agent, by id.
+        options: command line options of ``consat agent`` for all agents.
         exact: see `consat.network.deploy.environment.prepare`.
     """
 
@@ -73,15 +78,25 @@ class Fleet:
         self._folder.cleanup()
 
     def file(self, agent: str, ending: str = "yaml") -> Path:
-        """The private file of an agent, or another of its own, in a folder that only this user can read."""
+        """The path of a private file of an agent, in a folder that only this user can read.
+
+        Args:
+            agent: id of the agent.
+            ending: ``yaml`` for its part; another ending for another file.
+        """
         return Path(self._folder.name) / f"{spelled(agent)}.{ending}"
 
     def write(self, agent: str, part: Part) -> None:
-        """Write the private file of an agent; what it reads when it starts, or is told to read it again."""
+        """Write the part of an agent to its private file. The agent reads it when it starts and on the order ``reload``."""
         self.file(agent).write_text(write_part(part), encoding="utf-8")
 
     def start(self, agent: str, *options: str) -> None:
-        """Start an agent, or start it again; `options` of its own come after the common ones."""
+        """Start the process of an agent, or restart it.
+
+        Args:
+            agent: id of the agent.
+            *options: command line options of this agent, which follow the common ones.
+        """
         environment = dict(os.environ)
         prepare(environment, exact=self.exact)
         if agent in self._children:
@@ -99,19 +114,19 @@ class Fleet:
         self._children[agent] = child
 
     def running(self, agent: str) -> bool:
-        """Whether its process is."""
+        """Whether the process of an agent runs."""
         return agent in self._children and self._children[agent].process.poll() is None
 
     def exit_code(self, agent: str) -> int | None:
-        """With which its process ended; None while it runs, or if it never did."""
+        """The exit code of an agent's process; None while it runs, or if it was never started."""
         return self._children[agent].process.poll() if agent in self._children else None
 
     def pid(self, agent: str) -> int:
-        """Of its process."""
+        """The process id of an agent."""
         return self._children[agent].process.pid
 
     def tell(self, agent: str, order: Mapping[str, Any]) -> None:
-        """Write a line on its stdin; nothing if it is gone."""
+        """Write an order as a JSON line to the stdin of an agent. Does nothing if its process has ended."""
         if agent not in self._children:
             return
         stdin = self._children[agent].process.stdin
@@ -123,13 +138,13 @@ class Fleet:
             return
 
     def kill(self, agent: str) -> None:
-        """End it without a word (SIGKILL)."""
+        """Kill the process of an agent (SIGKILL)."""
         child = self._children[agent]
         child.process.kill()
         child.process.wait()
 
     def poll(self, timeout: float) -> list[Event]:
-        """The events that have come; waits for the first one no longer than `timeout`, s."""
+        """The events that have arrived. Waits at most `timeout`, s, for the first one."""
         events: list[Event] = []
         for key, _ in self._selector.select(timeout):
             _, child = key.data
@@ -143,7 +158,7 @@ class Fleet:
         return events
 
     def stop(self) -> list[Event]:
-        """Tell all to stop, wait for them, and end those that don't; their last events."""
+        """Tell all agents to stop, wait up to `PATIENCE`, and terminate those that still run. Returns their last events."""
         for agent in self._children:
             self.tell(agent, {"command": "stop"})
         events, end = [], time.monotonic() + PATIENCE
@@ -155,7 +170,7 @@ class Fleet:
         return events
 
     def _bury(self, child: _Child) -> None:
-        """Close what a process has left open."""
+        """Wait for the end of a process and close its pipes."""
         child.process.wait()
         for stream in (child.process.stdin, child.process.stdout):
             assert stream is not None
@@ -168,13 +183,16 @@ class Fleet:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens at.
+    """Free TCP ports of this machine.
 
-    They lie below those that systems give to connections going out: an agent that tries to reach a neighbour that is not there yet might
-    get that neighbour's port.
+    They lie below the range that systems use for outgoing connections. Otherwise an agent that connects to a neighbour that is not up yet
+    could be given the port of this neighbour.
+
+    Args:
+        count: number of ports.
 
     Raises:
-        NetworkError: there are not so many.
+        NetworkError: there are not enough free ports.
     """
     found: list[int] = []
     candidates = list(range(*PORTS))

@@ -1,4 +1,4 @@
-"""A whole team as processes on this machine, watched until it has converged, and a `Result` as from any other run."""
+"""Launches a whole team as processes on this machine, watches it until it has converged, and returns a `Result` as any other run."""
 
 from __future__ import annotations
 
@@ -36,34 +36,33 @@ from consat.scenario import Scenario, dump
 from consat.settings import Settings
 
 PATIENCE: Final = 600.0
-"""A team may take so long when nobody says, s."""
+"""Time limit of a launch if `Plan.until` is not given, s."""
 WINDOW: Final = 1.0
-"""A team that did not move for so long, s, has converged …"""
+"""Shortest time without motion after which a team counts as converged, s."""
 LINK_WINDOW: Final = 10.0
-"""… and in mode link for so long by the protocol's own clock; …"""
+"""The same in mode link, measured in the time of the protocol, s."""
 ROUND_TRIPS: Final = 10.0
-"""… and for so many times the longest delay."""
+"""Number of longest message delays that are added to this time."""
 
 Stop = Literal["satisfied", "converged", "never"]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a team is launched.
+    """Options of a launch.
 
     Attributes:
-        mode: how the agents talk.
-        rate: turns a second, Hz; None for the mode's own.
-        pace: of link, seconds of the protocol's time in each real one.
-        speed: the most that a body moves, length/s; None for no limit.
-        loss: probability that a message is dropped where it arrives.
-        delay: (low, high) for which each is held back there, s.
-        rounds: how many turns; None for no end.
-        until: how long, s; None for no end.
-        stop: when to end earlier; unless `rounds` or `until` say when, once all agents know all that there is to find (interior-point), or
-            after convergence.
+        mode: communication mode of the agents.
+        rate: turns per second, Hz; None for the default of the mode.
+        pace: in mode link, protocol time per real time, s/s.
+        speed: largest speed of a body, length/s; None for no limit.
+        loss: probability that an incoming message is dropped.
+        delay: (low, high) range of the random delay of incoming messages, s.
+        rounds: number of turns; None for no limit.
+        until: duration, s, counted from the time when all agents have begun; None for no limit.
+        stop: condition for an earlier end; None for the default in `ending`.
         keys: folder of the team's keys, see ``consat keys``; None for links without protection.
-        commands: a file of timed changes, see `consat.network.deploy.commands`.
+        commands: path of a file of timed changes, see `consat.network.deploy.commands`; None for no changes.
     """
 
     mode: Mode = DEFAULT_MODE
@@ -79,17 +78,21 @@ class Plan:
     commands: Path | None = None
 
     def __post_init__(self) -> None:
-        Manner(self.mode, self.rate, self.pace)  # what no agent could run is refused here, once
+        Manner(self.mode, self.rate, self.pace)  # raises once, before any agent starts, if the mode options are not valid
 
     @property
     def ending(self) -> Stop:
-        """When to end."""
+        """The condition for the end.
+
+        By default ``never`` if `rounds` or `until` is given. Otherwise ``satisfied`` in mode interior-point, which ends once all agents
+        know the outcome, and ``converged`` in the other modes.
+        """
         if self.rounds is not None or self.until is not None:
             return self.stop or "never"
         return self.stop or ("satisfied" if self.mode == "interior-point" else "converged")
 
     def options(self) -> list[str]:
-        """Of ``consat agent``."""
+        """The corresponding command line options of ``consat agent``."""
         given = {
             "--mode": self.mode, "--rate": self.rate, "--speed": self.speed, "--rounds": self.rounds,
             "--pace": self.pace if self.pace != 1.0 else None, "--loss": self.loss or None,
@@ -100,19 +103,19 @@ class Plan:
 
 @float64
 def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = False) -> Result:
-    """Start a team, watch it, stop it.
+    """Start a team as processes, watch it, stop it, and return the result.
 
     Args:
-        scenario: whose protocol, if it names one, must suit the mode.
-        plan: how.
-        quiet: no table in the terminal.
-        full: whether to list every agent in the summary, however many.
+        scenario: the team and settings. If it names a protocol, the mode must be able to run it.
+        plan: options of the launch.
+        quiet: whether to show no table in the terminal.
+        full: whether to list all agents in the summary, however many there are.
 
     Raises:
-        InvalidTeam: a cluster is not connected by links, or a constraint is a Python function, which no other process can be given.
-        InvalidSettings: the mode does not run the scenario's protocol.
-        InvalidScenario: a command cannot be carried out; nothing has started.
-        NetworkError: an agent's process failed.
+        InvalidTeam: a cluster is not connected by links, or a constraint is a Python function, which cannot be sent to another process.
+        InvalidSettings: the mode cannot run the protocol of the scenario.
+        InvalidScenario: a command cannot be carried out. No process has been started.
+        NetworkError: the process of an agent failed.
     """
     team = scenario.team
     settings = _settings(team, scenario.settings, plan.mode)
@@ -137,7 +140,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
     team = crew.stage.there()[0]
     trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
-    if crew.done:  # what it was before is in the margins of the trace; verdicts over time are of a team that is not changed
+    if crew.done:  # the margins of the trace cover the earlier states; the verdict is about the final team
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full=full) | {"mode": plan.mode, "network": observer.network()}
@@ -145,14 +148,20 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
 
 
 def _settings(team: Team, asked: Settings, mode: Mode) -> Settings:
-    """The protocol that runs is the mode's own, unless the scenario asks for one; in lockstep it is that of `run`."""
+    """The settings with the protocol to run: that of the scenario, else that of the mode; in lockstep the default of `consat.run`."""
     kind = asked.protocol.kind or (default_protocol(team, asked.protocol.estimates) if mode == "lockstep" else None)
     return asked.model_copy(update={"protocol": asked.protocol.model_copy(update={"kind": protocol_of(mode, kind)})})
 
 
 @dataclass(frozen=True)
 class _Rules:
-    """When a team has converged: in rounds or s."""
+    """Criterion for convergence. Times are in rounds (lockstep) or s.
+
+    Attributes:
+        window: time without motion.
+        distance: motion up to this counts as none, length.
+        earliest: first stamp at which convergence counts.
+    """
 
     window: float
     distance: float
@@ -170,20 +179,20 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
 
 
 class Crew:
-    """The agents of a launch: started, started again when they crash, told the time and what changes.
+    """Controls the agents of a launch: starts them, restarts them after a crash, sends them the time and the commands.
 
     Args:
-        fleet: their processes.
-        observer: what they tell.
-        plan: how they are launched.
-        scenario: of the team.
-        script: what changes.
-        parts: as they start.
+        fleet: the processes of the agents.
+        observer: collects what the agents report.
+        plan: options of the launch.
+        scenario: scenario of the team.
+        script: the commands.
+        parts: the part (local problem) of each agent at the start, by id.
 
     Attributes:
-        stages: how the team stood, one after the other, and since when.
-        epoch: when t = 0 was, s of Unix time; None before all are ready.
-        ready: the same by the monotonic clock of this machine.
+        stages: states of the team so far, in order of time.
+        epoch: Unix time of t = 0, s; None until all agents are ready.
+        ready: the same time on the monotonic clock of this machine, s.
     """
 
     def __init__(
@@ -200,32 +209,32 @@ class Crew:
 
     @property
     def stage(self) -> Stage:
-        """How the team stands now."""
+        """The current state of the team."""
         return self.stages[-1]
 
     @property
     def done(self) -> int:
-        """How many commands have been carried out."""
+        """Number of commands carried out so far."""
         return len(self.stages) - 1
 
     @property
     def timed(self) -> bool:
-        """Whether anything happens by the clock."""
+        """Whether anything depends on time: there are commands, or constraints move."""
         return bool(self._script.commands) or self.stage.team.moves
 
     @property
     def tick(self) -> float:
-        """Of a round, s; one where nothing goes by time."""
+        """Duration of a round, s; 1 if nothing depends on time."""
         return 1.0 / (self.plan.rate or ROUNDS_A_SECOND) if self.timed else 1.0
 
     @staticmethod
     def _stamp(unix: float) -> float:
-        """The stamp, by the monotonic clock of this machine, of a Unix time."""
+        """The stamp of a Unix time: the time on the monotonic clock of this machine, s."""
         return unix - time.time() + time.monotonic()
 
     @property
     def earliest(self) -> float:
-        """The first stamp at which the team may be done: when nothing is to happen any more; ∞ while that is not known."""
+        """The first stamp at which the team may be done: after the last command and the last motion of constraints. ∞ while not known."""
         if not self.timed:
             return -np.inf
         if self.done < len(self._script.commands):
@@ -238,7 +247,7 @@ class Crew:
         return np.inf if self.epoch is None else self._stamp(self.epoch) + last
 
     def start(self, agent: str) -> None:
-        """Start an agent, or start it again where its body was last seen; in lockstep from what it has on disk."""
+        """Start or restart an agent, with its body where it was last seen. In lockstep it resumes from its state on disk."""
         ids, seed = list(self.observer.team.ids), self._scenario.settings.start.seed
         own = ["--seed", str(seed * len(ids) + ids.index(agent))]
         if self.observer.seen[agent].places:
@@ -252,7 +261,11 @@ class Crew:
         self.fleet.start(agent, *own)
 
     def mend(self) -> None:
-        """Start those again that a signal has ended. Raises: NetworkError: one has failed by itself, and would again."""
+        """Restart agents whose process was ended by a signal.
+
+        Raises:
+            NetworkError: a process ended with an error. A restart would fail again.
+        """
         for agent in self.observer.team.ids:
             code = self.fleet.exit_code(agent) or 0
             if code > 0:
@@ -261,7 +274,7 @@ class Crew:
                 self.start(agent)
 
     def act(self) -> None:
-        """Tell the agents the time once all are ready, and then what changes, when it is due."""
+        """Send the agents the time once all are ready; after that, carry out the commands that are due."""
         if self.epoch is None:
             if not all(seen.born is not None for seen in self.observer.seen.values()):
                 return
@@ -276,13 +289,13 @@ class Crew:
             self.observer.present = self.stage.present
 
     def _carry_out(self, command: Timed) -> bool:
-        """Whether it is done; not before one who is to join is ready to."""
+        """Carry out a command. Returns False if it must wait, because the agent that is to join is not ready."""
         agent = command.agents[0]
         if command.command == "change":
             part = self._parts[agent]
             team = changed(part.team, changes_of(part.team, agent, command.constraint, command.parameters))
             self._parts[agent] = replace(part, team=team)
-            self.fleet.write(agent, self._parts[agent])  # for when it crashes
+            self.fleet.write(agent, self._parts[agent])  # for a restart after a crash
             self.fleet.tell(agent, {"command": "change", "constraint": command.constraint, **command.parameters})
             return True
         if command.command == "join" and not self._is_ready(agent):
@@ -294,15 +307,15 @@ class Crew:
         return True
 
     def _is_ready(self, agent: str) -> bool:
-        """Whether one who is to join stands by; it is started if it does not run."""
-        if agent not in self._standby and not self.fleet.running(agent):  # it has left before
+        """Whether an agent that is to join stands by. Starts its process if it does not run."""
+        if agent not in self._standby and not self.fleet.running(agent):  # it left earlier
             self._standby.add(agent)
             self.observer.seen[agent].born = None
             self.start(agent)
         return agent in self._standby and self.observer.seen[agent].born is not None
 
     def _split_anew(self, team: Team) -> None:
-        """New parts for those who are there: who holds what, and along which links it travels, may be other than before."""
+        """Send new parts to the agents of `team`, because the holders of estimates and the paths of messages may have changed."""
         self._generation += 1
         addresses = {agent: self._parts[agent].listen for agent in team.ids}
         run = next(iter(self._parts.values())).run
@@ -314,7 +327,14 @@ class Crew:
 
 
 def _watch(crew: Crew, rules: _Rules, title: str, quiet: bool) -> Ending:
-    """Until the team is to be stopped; why. `Plan.until` counts from when all agents have begun. Who crashes is started again."""
+    """Watch the team until it must be stopped. Returns why it ended. Restarts agents that crash.
+
+    Args:
+        crew: the agents.
+        rules: criterion for convergence.
+        title: title of the table in the terminal.
+        quiet: whether to show no table.
+    """
     began, plan, observer = time.monotonic(), crew.plan, crew.observer
     end = None if plan.until is not None else began + PATIENCE
     agents = observer.team.ids

@@ -1,4 +1,4 @@
-"""What an observer of a team of processes learns from their logs, and the `Trace` that it makes of it."""
+"""Observer of a team of processes: collects the events that the agents log and builds a `Trace` from them."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending, Trace, satisfied_from
 
 SAMPLE: Final = 0.05
-"""Time between two samples of a trace in time, s."""
+"""Sampling interval of a trace over time, s."""
 
 
 @dataclass
 class Seen:
-    """What one agent has told.
+    """The events of one agent so far.
 
     Attributes:
-        stamps: rounds or times.
-        places: (d,) where its body was at each.
-        report: the last one.
+        stamps: rounds or times, s, of the recorded positions.
+        places: position of its body, (d,), at each stamp.
+        report: its last report; None before the first.
         known: what it knows of the team, see `consat.network.node.station.Knowledge`.
-        known_from: since which stamp, or None.
-        settled_from: since which stamp it knows all that there is to find, or None; see `consat.network.node.station.Station.settled`.
+        known_from: stamp from which it knows this, or None.
+        settled_from: stamp from which it knows the final outcome, or None; see `consat.network.node.station.Station.settled`.
         finished: whether its last round is over.
-        born: when its process was ready, by its clock.
-        ended: its last event, if it came.
+        born: time at which its process was ready, by its own clock, s; None before.
+        ended: its ``end`` event, or None.
     """
 
     stamps: list[float] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Seen:
     _before: Counter[str] = field(default_factory=Counter)
 
     def take(self, event: Event) -> None:
-        """Learn from an event."""
+        """Update from an event."""
         match event["event"]:
             case "standby":
                 self.born = event["t"]
@@ -88,11 +88,11 @@ class Seen:
 
     @property
     def sent(self) -> Counter[str]:
-        """In all lives."""
+        """Numbers of messages and floats sent, including those before restarts."""
         return self._before + self._sent
 
     def moved(self, since: float) -> float:
-        """How far it was, at most, from where it is, on any axis, since a stamp; ∞ if it has told of nothing that old."""
+        """The largest distance, on any axis, from its current position since the stamp `since`; ∞ if its record starts later."""
         if not self.stamps or self.stamps[0] > since:
             return np.inf
         first = int(np.searchsorted(self.stamps, since))
@@ -101,16 +101,19 @@ class Seen:
 
 
 class Observer:
-    """Watches a team through its logs.
+    """Observes a team through the events of its agents.
 
     Args:
-        team: as everybody together knows it.
-        start: (N, d) where the bodies begin.
-        clock: what stamps count.
+        team: the whole team.
+        start: (N, d) start positions of the bodies, length.
+        clock: unit of the stamps: ``round`` or ``time``.
 
     Attributes:
-        present: who is there now.
-        origin: the stamp at t = 0; None where nothing goes by it: then time is counted from the first stamp.
+        team: the whole team.
+        clock: unit of the stamps.
+        present: ids of the agents that are present now.
+        origin: stamp of t = 0. None if nothing depends on time; then time is counted from the first stamp.
+        seen: the events of each agent, by id.
     """
 
     def __init__(self, team: Team, start: np.ndarray, clock: str) -> None:
@@ -120,42 +123,50 @@ class Observer:
         self._start = start
 
     def take(self, events: Sequence[Event]) -> None:
-        """Learn from events."""
+        """Update from events. Events of unknown agents are ignored."""
         for event in events:
             if event.get("id") in self.seen:
                 self.seen[event["id"]].take(event)
 
     @property
     def there(self) -> list[Seen]:
-        """Of those who are there."""
+        """The records of the agents that are present."""
         return [seen for agent, seen in self.seen.items() if agent in self.present]
 
     def all_known(self) -> tuple[Knowledge, float | None]:
-        """What all agents know, and since which stamp. Where some know that all that they can hear of are satisfied, and others that the
-        team cannot be, it is infeasible."""
+        """What all agents know, and the stamp from which they know it; (None, None) if any agent knows nothing.
+
+        Some agents may know that all agents they can hear of are satisfied, while others know that the team is infeasible. Then the result
+        is ``infeasible``.
+        """
         known = [seen.known for seen in self.there]
         if None in known:
             return None, None
         return "infeasible" if "infeasible" in known else "satisfied", max(seen.known_from or 0.0 for seen in self.there)
 
     def concluded(self) -> float | None:
-        """Since which stamp all know all that there is to find, or None."""
+        """The stamp from which all agents know the final outcome, or None."""
         since = [seen.settled_from for seen in self.there]
         return None if None in since else max(stamp for stamp in since if stamp is not None)
 
     def settled(self, window: float, distance: float) -> bool:
-        """Whether nobody has moved by more than `distance` over the last `window` of stamps, and all are up and heard."""
+        """Whether the team has converged: all agents hear all their neighbours, and none has moved.
+
+        Args:
+            window: length of the time to look back, in units of stamps.
+            distance: motion up to this on each axis counts as none, length.
+        """
         if any(seen.report is None or not all(peer["up"] for peer in seen.report["peers"].values()) for seen in self.there):
             return False
         latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in self.there)
         return all(seen.moved(latest - window) <= distance for seen in self.there)
 
     def positions(self) -> np.ndarray:
-        """(N, d) where the bodies are."""
+        """(N, d) current positions of the bodies, length."""
         return np.array([seen.places[-1] if seen.places else start for seen, start in zip(self.seen.values(), self._start, strict=True)])
 
     def network(self) -> dict[str, Any]:
-        """What the agents measured of the network, for the summary."""
+        """Network measurements of the agents, for the summary: loss, round-trip time (s), messages, CPU time (s)."""
         links, agents = [], {}
         for agent, seen in self.seen.items():
             report = seen.report or {}
@@ -174,15 +185,15 @@ class Observer:
     def trace(
         self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], tick: float
     ) -> Trace:  # fmt: skip
-        """All of it as a trace, of the agents that are there at the end. Positions between two stamps are those at the earlier one.
+        """The trace of the agents that are present at the end. A position holds until the next stamp.
 
         Args:
-            copies: who holds what at the end.
-            nu: the smoothing.
+            copies: the estimates at the end: holders and positions held.
+            nu: smoothing of the margin.
             ending: why the run ended.
-            seconds: spent.
-            stages: how the team stood, one after the other.
-            tick: of a round, s.
+            seconds: wall-clock times of compilation and run, s.
+            stages: states of the team, in order of time.
+            tick: duration of a round, s.
         """
         begin = self._begin()
         end = max([begin, *(seen.stamps[-1] for seen in self.seen.values() if seen.stamps)])
@@ -225,7 +236,7 @@ class Observer:
         )
 
     def _known_from(self) -> float | None:
-        """Since which round all know it, or since how many s after the first stamp."""
+        """The round from which all agents know the outcome, or the time, s, since `_begin`; None if they do not."""
         since = self.all_known()[1]
         if since is None:
             return None
@@ -245,7 +256,17 @@ class Observer:
 
 
 def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: Nu) -> tuple[np.ndarray, np.ndarray]:
-    """(T, N) ᾱ_i, +∞ of those who are not there, and (T,) β, by the constraints as they were at each of the times, (T,), s."""
+    """Margins by the constraints that were valid at each time.
+
+    Args:
+        stages: states of the team, in order of time.
+        position: (T, N, d) positions.
+        times: (T,) s.
+        nu: smoothing.
+
+    Returns:
+        (T, N) ᾱ_i, +∞ for absent agents; and (T,) β.
+    """
     margins, smooth = np.full(position.shape[:2], np.inf), np.zeros(len(times))
     which = np.searchsorted([stage.since for stage in stages], times, side="right") - 1
     for k in np.unique(which):
@@ -259,7 +280,7 @@ def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: 
 
 @jax.jit
 def _look(observer: Objective, live: Live | None, position: jax.Array, times: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
-    """(T, N) ᾱ_i and (T,) β."""
+    """(T, N) ᾱ_i and (T,) β, compiled as one program. `live` gives the moving parameters; None if nothing moves."""
 
     def at(x: jax.Array, time: jax.Array) -> tuple[jax.Array, jax.Array]:
         here = observer if live is None else observer.with_parameters(live.at(time))
@@ -269,7 +290,7 @@ def _look(observer: Objective, live: Live | None, position: jax.Array, times: ja
 
 
 def _motion(times: np.ndarray, margin: np.ndarray) -> dict[str, Any]:
-    """Of ``launch --json`` what is said of a team that moves or is changed, as of ``run``; both (T,)."""
+    """The entry ``motion`` of the summary, for a team that moves or is changed, from (T,) times, s, and (T,) margins."""
     good = margin > 0
     first = int(np.argmax(good)) if good.any() else None
     return {

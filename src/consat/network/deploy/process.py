@@ -1,10 +1,10 @@
-"""One agent as a process: its steps in real time over a real network, commands and measurements from stdin, JSON lines to stdout.
+"""One agent as a process: steps in real time over a real network, orders and measurements from stdin, JSON lines to stdout.
 
-A line on stdin is ``{"position": [x, y]}``, a measurement, which may have a ``"stamp"``, or an order such as ``{"command": "leave"}``, see
-`consat.network.node.orders`; what is anything else is reported and ignored. Each line on stdout is an event: ``start``, ``report``,
-``command`` (a velocity, and for how long it is valid), ``satisfied``, ``changed``, ``rejected`` …
+A line on stdin is a measurement ``{"position": [x, y]}``, optionally with a ``"stamp"``, or an order such as ``{"command": "leave"}``; see
+`consat.network.node.orders`. Other lines are reported and ignored. Each line on stdout is an event: ``start``, ``report``, ``command`` (a
+velocity and the time for which it is valid), ``satisfied``, ``changed``, ``rejected`` …
 
-Whatever ends the agent, or takes its sensor from it, its last command is to stand.
+If the agent ends for any reason, or loses its sensor, its last command is zero velocity.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ from consat.network.transports.faults import Weathered
 from consat.robots.description import asked
 
 NAP: Final = 0.05
-"""No wait is longer, s, so that signals and commands are soon seen."""
+"""Longest wait, s, so that signals and orders are noticed soon."""
 NO_FILE: Final = "the agent was started from a scenario; only a part of its own can be read again"
 LINGER: Final = 2.0
-"""An agent that is done because of what it knows goes on so long, s, so that its neighbours learn of it."""
+"""Time that an agent continues after it knows the outcome, s, so that its neighbours learn it, too."""
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What surrounds an agent's process.
+    """Options of an agent's process.
 
     Attributes:
-        loss: probability that a message that arrives is dropped, for trials.
-        delay: (low, high) for which each is held back, s, for trials.
-        seed: of loss and delay.
-        speed: the most that the body moves, length/s.
-        robot: the kind of robot that is commanded; None for that of the scenario, if any.
-        sensor: ``simulated``, or ``stdin``: positions are measured by somebody else and read there.
-        sensor_timeout: after so long without a measurement, s, the body is commanded to stand.
-        position: where a simulated body is; None for the start in the part.
-        until: when to stop, s; None for never.
-        stop: whether to stop once all are known to be satisfied, or to be near the best where they cannot be.
-        attached: stop when stdin ends, as it does when the process that started this one dies.
-        keys: folder of the team's or the agent's keys; None for a network without protection.
-        epoch: when t = 0 is, s of Unix time; None for what the part says.
-        standby: wait for the order to join.
+        loss: probability that an incoming message is dropped, for experiments.
+        delay: (low, high) range of the random delay of incoming messages, s, for experiments.
+        seed: seed of loss and delay.
+        speed: largest speed of the body, length/s.
+        robot: kind of the robot that is commanded; None for that of the scenario, if any.
+        sensor: ``simulated``, or ``stdin`` if measured positions are read from stdin.
+        sensor_timeout: time without a measurement after which the body is commanded to stop, s.
+        position: start position of a simulated body, (d,), length; None for the start in the part.
+        until: duration, s; None for no limit.
+        stop: ``satisfied`` to stop once it is known that all agents are satisfied, or that the team is infeasible and near its best margin.
+        attached: whether to stop when stdin ends, as it does when the parent process dies.
+        keys: folder of the keys of the team or the agent; None for a network without protection.
+        epoch: Unix time of t = 0, s; None for the one in the part.
+        standby: whether to wait for the order ``join``.
     """
 
     loss: float = 0.0
@@ -84,7 +84,13 @@ class Circumstances:
 
 
 class Anew(NamedTuple):
-    """With what an agent goes on after it has read its part again: the part, the core for it, and who is there."""
+    """The state with which an agent starts, or continues after it has reloaded its part.
+
+    Attributes:
+        part: its local problem.
+        core: the compiled protocol for this part.
+        membership: which agents are present.
+    """
 
     part: Part
     core: Embodied
@@ -92,17 +98,17 @@ class Anew(NamedTuple):
 
 
 def run_agent(part: Part, manner: Manner, around: Circumstances, again: Callable[[], Part] | None = None) -> None:
-    """Run one agent until it is done, or told to stop.
+    """Run one agent until it is done or told to stop.
 
     Args:
-        part: the agent's own.
-        manner: how it runs.
-        around: what surrounds it.
-        again: reads the part again; None where it is of no file of its own.
+        part: local problem of the agent.
+        manner: its mode and rate.
+        around: options of the process.
+        again: reads the part from its file again; None if the part has no file.
 
     Raises:
-        NetworkError: its address is taken, or its keys are unfit.
-        InvalidSettings: mode and protocol do not fit, or constraints move and nobody can say when t = 0 is.
+        NetworkError: its address is in use, or its keys are not usable.
+        InvalidSettings: mode and protocol do not fit, or constraints move and the time t = 0 is not known.
     """
     part = part if around.epoch is None else replace(part, epoch=around.epoch)
     jax.config.update("jax_enable_x64", True)
@@ -132,8 +138,17 @@ def run_agent(part: Part, manner: Manner, around: Circumstances, again: Callable
 
 
 class _Own(NamedTuple):
-    """What stays when the part is read again: the body, what the process is told, who reads the part and in which thread, what is being
-    read, and when the process is to end."""
+    """Objects that are kept when the part is reloaded.
+
+    Attributes:
+        body: the body of the agent.
+        orders: orders and measurements from stdin.
+        helm: sends velocity commands to the body.
+        again: reads the part from its file; None if the part has no file.
+        reader: thread that reads and compiles a new part.
+        reading: the reload order in progress, with its future result; at most one.
+        end: time on the monotonic clock at which the process ends, s.
+    """
 
     body: Body
     orders: Orders
@@ -145,7 +160,7 @@ class _Own(NamedTuple):
 
 
 def _live(begin: Anew, manner: Manner, around: Circumstances, own: _Own) -> Anew | str:
-    """From one part until it is read again, or until the end: why."""
+    """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
     part = begin.part
     with _transport(part, manner, around) as transport:
         runner = runner_of(
@@ -158,7 +173,7 @@ def _live(begin: Anew, manner: Manner, around: Circumstances, own: _Own) -> Anew
         try:
             told = _loop(runner, transport, own, around)
         except BaseException:
-            own.helm.stand()  # before the transport is closed, which may take its time
+            own.helm.stand()  # before the transport is closed, which may take long
             raise
         if isinstance(told, str):
             own.helm.stand()
@@ -176,7 +191,7 @@ def _loop(runner: Runner, transport: Transport, own: _Own, around: Circumstances
         helm.sense(orders)
         due = runner.step()
         now = time.monotonic()
-        helm.sense(orders)  # what came during the step
+        helm.sense(orders)  # measurements that arrived during the step
         helm.steer(station.target)
         if (anew := _obey(runner, own)) is not None:
             return anew
@@ -193,9 +208,9 @@ def _loop(runner: Runner, transport: Transport, own: _Own, around: Circumstances
 
 
 def _obey(runner: Runner, own: _Own) -> Anew | None:
-    """Carry out what the process was told, and say what it does not do; with what it goes on, once it has read its part again.
+    """Carry out the orders from stdin and log those that are rejected. Returns the state to continue with once a reload is done.
 
-    While a part is read and compiled, in a thread of its own, the agent goes on as before; the orders that came after wait.
+    A new part is read and compiled in a separate thread. Meanwhile the agent continues as before, and later orders wait.
     """
     station, orders = runner.station, own.orders
     for line, why in orders.rejected():
@@ -221,14 +236,14 @@ def _obey(runner: Runner, own: _Own) -> Anew | None:
 
 
 def _carried(station: Station, part: Part, core: Embodied) -> Anew:
-    """With what an agent goes on, from the estimates that it has."""
+    """The state after a reload, starting from the current estimates."""
     known = station.estimates
     first = [known.get(agent, row) for agent, row in zip(part.team.ids, part.first, strict=True)]
     return Anew(replace(part, first=np.array(first), epoch=station.epoch if part.epoch is None else part.epoch), core, station.membership)
 
 
 def _renewed(before: Part, core: Embodied, again: Callable[[], Part] | None) -> tuple[Part, Embodied] | str:
-    """The part as it is in its file now, and a core for it, compiled; or why it cannot be used."""
+    """The part read from its file again, with a compiled core; or the reason why it cannot be used."""
     if again is None:
         return NO_FILE
     try:
@@ -241,7 +256,7 @@ def _renewed(before: Part, core: Embodied, again: Callable[[], Part] | None) -> 
 
 
 def _fitting(part: Part, before: Part) -> Part:
-    """The part, if it is one of the same agent in the same run. Raises: InvalidSettings."""
+    """The part unchanged. Raises: InvalidSettings: its agent, run, address or dimension differs from `before`."""
     same = {
         "agent": (before.me, part.me), "run": (before.run, part.run), "address": (before.listen, part.listen),
         "dimension": (before.team.dimension, part.team.dimension),
@@ -253,7 +268,7 @@ def _fitting(part: Part, before: Part) -> Part:
 
 
 def _heed(runner: Runner, order: Order) -> str | None:
-    """Carry out an order; or why not, in one line."""
+    """Carry out an order. Returns None, or one line that says why it was rejected."""
     if order.command == "join":
         return "the agent is in the team already"
     if order.command == "clock":
@@ -268,7 +283,7 @@ def _heed(runner: Runner, order: Order) -> str | None:
 
 
 def _wait_to_join(begin: Anew, orders: Orders, again: Callable[[], Part] | None) -> Anew | str:
-    """Until the order to join comes: with what the agent begins; or why the process is to end before."""
+    """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
     part, core = begin.part, begin.core
 
     def write(event: str, **details: Any) -> None:
@@ -297,14 +312,14 @@ def _wait_to_join(begin: Anew, orders: Orders, again: Callable[[], Part] | None)
 
 
 def _warm(core: Embodied) -> None:
-    """Compile before the first neighbour can wait for it."""
+    """Compile the core by running one turn, so that no neighbour waits for the compilation later."""
     moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
     _, _, look = core.turn(core.begin(core.part.first), *core.empty(), moment)
     core.margin(look.bodies)
 
 
 def _measured(part: Part, around: Circumstances) -> MeasuredBody:
-    """A body that somebody else moves: a robot, if the scenario or the command line names one."""
+    """A body with an external sensor: a robot if the scenario or the command line names one, else a point."""
     robots = asked(around.robot, None, part.robots, part.team.ids)
     if robots is None:
         return MeasuredBody(around.speed, around.sensor_timeout)
@@ -336,7 +351,7 @@ def _transport(part: Part, manner: Manner, around: Circumstances) -> Iterator[Tr
 
 
 def _protected(address: str) -> str:
-    """The address with encryption. One that has it keeps it also where there are no keys: then nobody listens rather than in the clear."""
+    """The address with TLS instead of TCP. A TLS address stays as it is."""
     kind, _, rest = address.partition("/")
     return f"tls/{rest}" if kind == "tcp" else address
 

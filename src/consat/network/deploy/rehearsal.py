@@ -1,5 +1,6 @@
-"""A whole team over the network in memory, agent by agent as each would run in its process, on a clock that only moves when all have done
-what is due: exact, repeatable, and as fast as the agents compute.
+"""Simulates a launch in one process: the runners of all agents over the network in memory, on a simulated clock.
+
+The clock advances when all agents have done the steps that are due. So a run is deterministic, and as fast as the agents compute.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ from consat.network.node.part import Part
 from consat.network.transports.memory import Air
 
 OPENING = 0.01
-"""Between opening its transport and its first step an agent has so long to get messages, s."""
+"""Time between the start of an agent and its first step, s, in which messages can arrive."""
 SHORTEST = 1e-6
-"""Time passes by at least this between two steps of an agent, s."""
+"""Shortest time between two steps of an agent, s."""
 
 
 class Rehearsal:
-    """The agents of some parts.
+    """A simulated launch of the agents with the given parts.
 
     Args:
-        parts: by agent.
-        manner: how they run.
-        air: the network between them.
-        speed: the most that a body moves, length/s.
-        build: makes the runner of an agent; what a process would make if None.
-        skew: how far the Unix time of each agent is ahead of that of the network, s.
+        parts: the part (local problem) of each agent, by id.
+        manner: mode and rate of the agents.
+        air: the simulated network.
+        speed: largest speed of a body, length/s.
+        build: makes the runner of an agent; by default as a process does.
+        skew: by how much the Unix time of an agent is ahead of the time of the network, s, by id; 0 for agents that are not listed.
     """
 
     def __init__(
@@ -53,11 +54,11 @@ class Rehearsal:
         self._due: dict[str, float] = {}
 
     def start(self, *agents: str, **changes: Any) -> None:
-        """Start agents, all if none is named, or start them again after a `kill`: what they remember is what is on disk.
+        """Start agents, or restart them after a `kill`. A restarted agent has only its state on disk.
 
         Args:
-            *agents: their ids.
-            **changes: to their `Manner`.
+            *agents: ids of the agents; all if none is given.
+            **changes: fields of `Manner` to change for these agents.
         """
         for agent in agents or tuple(self.parts):
             part = self.parts[agent]
@@ -75,13 +76,21 @@ class Rehearsal:
         return self.air.now + skew
 
     def kill(self, *agents: str) -> None:
-        """As a crash does: without a word."""
+        """End agents without notice, as a crash does."""
         for agent in agents:
             self.air.close(agent)
             del self.runners[agent], self._due[agent]
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let time pass; whether `until`, looked at after every step, came true."""
+        """Advance the simulated clock.
+
+        Args:
+            seconds: duration, s.
+            until: condition for an earlier end, checked each time the clock advances.
+
+        Returns:
+            whether the condition became true.
+        """
         end = self.air.now + seconds
         with jax.enable_x64(True):
             while (now := min(self.air.next(), *self._due.values(), np.inf)) <= end:
@@ -104,5 +113,5 @@ class Rehearsal:
         self._due[agent] = max(due, self.air.now + SHORTEST)
 
     def positions(self) -> dict[str, np.ndarray]:
-        """Where the bodies are."""
+        """The current position of each body, (d,), by id."""
         return {agent: body.position().copy() for agent, body in self.bodies.items()}
