@@ -169,6 +169,7 @@ def _replaced(solution: Solution, by: Solution, agents: Bools, constraints: Bool
 
 
 def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: int, *, concave: bool) -> Optimum:
+    """The optimum of a team that is not concave quadratic: ascent from many starts, then polishing; arguments as in `max_min`."""
     size = scale(team)
     wanted = starts or (4 if concave else STARTS)
     count = max(1, min(wanted, MOST_VALUES // max(len(team.owner), 1)))

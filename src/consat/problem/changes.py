@@ -17,6 +17,7 @@ from consat.problem.schedule import Schedule
 from consat.problem.team import Team
 
 WEIGHT: Final = Number(None, positive=True)
+"""What the weight of a constraint must satisfy."""
 
 
 class Change(NamedTuple):

@@ -70,10 +70,12 @@ class Family:
 
     @property
     def size(self) -> int:
+        """M, the number of constraints."""
         return len(self.owner)
 
     @property
     def arity(self) -> int:
+        """Number of positions that ψ takes."""
         return int(self.agents.shape[1])
 
 

@@ -30,6 +30,7 @@ from consat.problem.schedule import Schedule, Track
 Ints = NDArray[np.int64]
 
 SHAPES = ("line", "ring", "grid", "random")
+"""Arrangements of the places of a group; see `Group`."""
 OTHER = "other"
 """In a text expression of a group: the agent that the argument ``agent`` selects."""
 SELF = "self"
@@ -208,6 +209,7 @@ class Expansion:
         return self.told_apart(made)
 
     def entries(self) -> Iterator[tuple[Path, Each]]:
+        """(path, constraint with its owners) for each constraint of the group; nested lists are flattened."""
         for k, item in enumerate(self.group.constraints):
             path = (*self.path, "constraints", k)
             outer = item if isinstance(item, Each) else Each(item)
@@ -221,6 +223,7 @@ class Expansion:
                     self.faults.append(Fault(path, message, _who(self.group)))
 
     def good_name(self, name: Any, named: dict[str, Path], path: Path, where: str) -> bool:
+        """Whether a given name is valid and new in the group. Adds it to `named`, or a fault."""
         if not isinstance(name, str) or not name.strip() or not name.isprintable():
             self.faults.append(Fault((*path, "name"), f"name is {shown(name)}, but must be a printable text", where))
         elif name in named:
@@ -232,6 +235,7 @@ class Expansion:
         return False
 
     def part(self, entry: Each, path: Path, where: str) -> Part | None:
+        """The part for one constraint of the group, with one row per owner and agent read, without names; None if it has faults."""
         constraint, known = entry.constraint, len(self.faults)
         rows = self.members(entry.of, path, where)
         slots = self.slots(constraint, entry.agent, path, where)
@@ -299,6 +303,7 @@ class Expansion:
         relation: Any
 
     def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> Slots:
+        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`."""
         reads: list[Any] = []
         relation: Any = None
         written = constraint.source is not None
@@ -359,6 +364,7 @@ class Expansion:
         return rows[:0], rows[:0]
 
     def apart_from_itself(self, rows: Ints, others: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+        """Resolve an array of indices. Adds a fault if it names an owner itself."""
         if (rows == others).any():
             self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
         return rows, others + self.first
@@ -380,6 +386,7 @@ class Expansion:
         return rows[exists], other[exists] + self.first
 
     def nearest(self, k: int, rows: Ints) -> tuple[Ints, Ints]:
+        """Resolve ``{"nearest": k}``: k rows for each owner."""
         from scipy.spatial import cKDTree
 
         places = self.layout.places

@@ -17,6 +17,7 @@ LARGEST = 1e100
 """Largest size of a number in the input. The square must stay finite in float64."""
 
 Path = tuple[str | int, ...]
+"""A place in the input as keys and indices; see `consat.errors.Fault`."""
 Moving: TypeAlias = "np.ndarray | Schedule"
 """A checked parameter: a constant array, or a schedule if it moves with time."""
 

@@ -28,8 +28,10 @@ MOST_NAMED = 100_000
 INSTANTS = 12
 """Approximate number of times at which moving constraints are sampled; see `Team.instants`."""
 LONGEST_UNIT = 16
+"""Largest length of the name of a unit, in characters."""
 
 TOPOLOGIES = ("line", "ring", "star", "complete", "task")
+"""Names of link graphs: see `topology`."""
 
 Links: TypeAlias = "str | nx.Graph | np.ndarray | Iterable[tuple[str, str]]"
 

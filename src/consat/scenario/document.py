@@ -29,6 +29,7 @@ from consat.errors import AT_KEY, Fault, InvalidInput, InvalidScenario, Place, s
 LARGEST: Final = 16 * 2**20
 """Largest size of a file, bytes."""
 DEEPEST: Final = 40
+"""Largest nesting depth of a file."""
 
 Path = tuple[str | int, ...]
 

@@ -48,6 +48,7 @@ class _Faults:
         self.take([Fault(path, message, where, offset)])
 
     def take(self, faults: Iterable[Fault]) -> None:
+        """Add the faults whose paths are not at or below that of an earlier call."""
         fresh = [fault for fault in faults if not any(fault.path[: n + 1] in self.paths for n in range(len(fault.path)))]
         self.found += fresh
         self.paths |= {fault.path for fault in fresh}

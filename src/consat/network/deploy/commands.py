@@ -25,6 +25,7 @@ COMMANDS: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """The commands, and the keys that each requires besides ``at``. Only ``change`` has further keys: the parameters."""
 RELINK: Final = ("connect", "disconnect")
+"""Commands that add or remove a link."""
 
 
 class Stage(NamedTuple):

@@ -25,11 +25,13 @@ from consat.network.node.part import Part, write_part
 PATIENCE: Final = 3.0
 """Time that an agent has to stop by itself before it is terminated, s."""
 LARGEST_READ: Final = 2**20
+"""Largest number of bytes read from the output of an agent at once."""
 
 PORTS: Final = (10240, 32768)
 """Range of the ports of a team; the upper end is excluded."""
 
 Event = Mapping[str, Any]
+"""An event that an agent has written to stdout; see `consat.network.deploy.process`."""
 
 
 @dataclass

@@ -45,6 +45,7 @@ ROUND_TRIPS: Final = 10.0
 """Number of longest message delays that are added to this time."""
 
 Stop = Literal["satisfied", "converged", "never"]
+"""Condition for the end of a launch: all agents know the outcome, the team has converged, or none."""
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,15 @@ from consat.errors import InvalidExpression, counted
 from consat.problem.constraints.functions import safe_norm
 
 MAX_LENGTH: Final = 2000
+"""Largest length of an expression, in characters."""
 MAX_DEPTH: Final = 50
+"""Largest nesting depth."""
 MAX_NODES: Final = 400
+"""Largest number of numbers, positions and operations."""
 MAX_EXPONENT: Final = 16
+"""Largest size of an exponent."""
 MAX_NUMBER: Final = 1e15
+"""Largest size of a literal number."""
 
 
 class _Operation(NamedTuple):
@@ -232,6 +237,7 @@ class _Translator:
         self.moves = False
 
     def translate(self, node: ast.expr) -> _Node:
+        """The node for a piece of Python syntax, by the method that `_ALLOWED` names. Checks the limits on depth and size."""
         self.nodes += 1
         self.depth += 1
         if self.depth > MAX_DEPTH:
@@ -331,12 +337,15 @@ class _Translator:
         return _apply(name, self.column(node), *(self.translate(argument) for argument in node.args))
 
     def fault(self, node: ast.expr, message: str) -> NoReturn:
+        """Raises: InvalidExpression: always, with the column of `node`."""
         raise InvalidExpression(message, self.column(node))
 
     def column(self, node: ast.expr) -> int:
+        """The column in the text, in characters from 0."""
         return len(self.encoded[: self.start + node.col_offset].decode())
 
     def segment(self, node: ast.expr) -> str:
+        """The text of a piece of syntax, unchanged."""
         return self.encoded[self.start + node.col_offset : self.start + (node.end_col_offset or 0)].decode()
 
 
