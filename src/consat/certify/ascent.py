@@ -64,6 +64,8 @@ def _margins(objective: Objective, groups: Groups, x: Array) -> Array:
 @jax.jit
 @functools.partial(jax.vmap, in_axes=(None, None, None, 0, None, None))
 def _climb(objective: Objective, groups: Groups, agents: Groups, x: Array, nu: Array, reach: Array) -> Array:
+    """`STEPS` steps of gradient ascent on β_c at one ν, for each start and cluster. `reach` limits the step of an agent, length."""
+
     def smooth(x: Array) -> tuple[Array, Array]:
         each = -groups.logsumexp(-nu * objective.psi(x))[0] / nu
         return jnp.sum(jnp.where(jnp.isfinite(each), each, 0.0)), each

@@ -243,7 +243,7 @@ def _composed(facts: Atom, a: Node) -> Node:
     convex = h.convex & (affine | (h.rising & u.convex) | (h.falling & u.concave))
     concave = h.concave & (affine | (h.rising & u.concave) | (h.falling & u.convex))
     strict = u.strict & ~affine[..., None]
-    if a.degree == 1 and a.terms is not None:  # no function of `ATOMS` is affine on an interval of nonzero length
+    if a.degree == 1 and a.terms is not None:  # no function of `ATOMS` is affine on the whole line
         varies = np.any(np.abs(a.terms[1]) > ROUNDING * a.sizes[1], axis=(-2, -1))
         strict = np.stack([np.zeros_like(varies)] * (a.terms[1].shape[-2] + 1) + [varies], axis=-1)
     return Node(a.shape, None, h.low, h.high, rule=Bend(convex, concave, np.zeros_like(convex), strict))
