@@ -1,4 +1,4 @@
-"""Linear algebra of many small symmetric systems at once; the systems are the last axis of every array, the lanes."""
+"""Linear algebra for many small symmetric systems at once. The last axis of every array is the index of the system (the lane)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 LOOPED = 16
-"""Systems of up to so many unknowns are eliminated by a loop over the pivots, larger ones by halves."""
+"""Largest number of unknowns for elimination by a loop over the pivots; larger systems are split into halves recursively."""
 
 
 def product(left: Array, right: Array) -> Array:
@@ -41,7 +41,7 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
         (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
     """
     size = len(matrix)
-    if size > LOOPED:  # by halves
+    if size > LOOPED:  # block elimination with two halves
         half = size // 2
         corner = jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
         found, first = solve(matrix[:half, :half], corner)
@@ -64,13 +64,13 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Array, Array]:
-    """Add up the neighbours' quadratics over an agent's own variables.
+    """Sum of the neighbours' quadratics over an agent's own variables.
 
     Args:
-        matrix: (g, p, p, A) of the neighbours.
-        vector: (g, p, A) of the neighbours.
-        shared: (g, p, A) which of the own variables these are; N and more: none.
-        size: N.
+        matrix: (g, p, p, A) matrices of the g neighbours.
+        vector: (g, p, A) vectors of the neighbours.
+        shared: (g, p, A) index of each shared variable among the agent's own; N and more mark padding.
+        size: N, the number of own variables.
 
     Returns:
         (N, N, A) and (N, A).
@@ -81,16 +81,16 @@ def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Arra
 
 
 def reduced(matrix: Array, vector: Array, shared: Array) -> tuple[Array, Array, Array, Array]:
-    """Minimise ½ yᵀMy − hᵀy over all variables but those shared with a neighbour, for each neighbour (a Schur complement).
+    """Minimise ½ yᵀMy − hᵀy over all variables that are not shared with a neighbour, for each neighbour (a Schur complement).
 
     Args:
         matrix: (N, N, A) M.
         vector: (N, A) h.
-        shared: (g, p, A) the variables that stay; N and more: none.
+        shared: (g, p, A) indices of the shared variables, which are kept; N and more mark padding.
 
     Returns:
-        (g, p, p, A) and (g, p, A) the quadratic that is left, (g, A) how much the minimum is below zero, and (g, A) whether M is positive
-        definite on what is eliminated.
+        (g, p, p, A) and (g, p, A) the remaining quadratic, (g, A) minus the minimum over the eliminated variables where the shared ones
+        are 0, and (g, A) whether M is positive definite on the eliminated variables.
     """
     size, count = vector.shape
     g, p, _ = shared.shape
