@@ -143,6 +143,8 @@ class Chosen:
 
 
 class _Loop(NamedTuple):
+    """Carry of the loop over rounds. `places`: number of recorded rounds; `told`: whether all agents know that all are satisfied."""
+
     done: Array
     now: Now
     streak: Array

@@ -52,6 +52,8 @@ class _Book(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of this process's agents."""
+
     now: Now
     number: int
     """Number of the next round."""
@@ -271,6 +273,8 @@ def _collectives(mesh: Mesh) -> tuple[Callable[[Array], Array], Callable[[Array]
 
 
 class _Programs(NamedTuple):
+    """The compiled functions of `_compiled`."""
+
     begin: Callable[..., Now]
     empty: Callable[..., _Book]
     note: Callable[..., _Book]

@@ -421,7 +421,7 @@ class Session:
 
     @property
     def dimension(self) -> int:
-        """d."""
+        """d, the dimension of the space."""
         return self._engine.ready.team.dimension
 
     @property

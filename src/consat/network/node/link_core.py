@@ -33,7 +33,7 @@ from consat.numerics import quick_compilation
 from consat.protocols.local.proximal import Memory
 
 AGREE = 0.05
-"""ε."""
+"""ε: fraction by which λ_ij moves towards −λ̂_ji at each message."""
 SHORTEST = 1e-4
 """Smallest step h, s, for two steps at almost the same time."""
 

@@ -215,7 +215,7 @@ class Lockstep:
         """The rows of messages to neighbours that remain, for protocols without messages per neighbour."""
         return Rows(said.link[rows], np.zeros((len(self.station.present), 0)))
 
-    # -- memory ------------------------------------------------------------------------------------------------------------------------
+    # -- stored state ------------------------------------------------------------------------------------------------------------------
 
     def _size(self) -> int:
         """Largest size of the stored record, in bytes: that with all agents present."""

@@ -72,7 +72,7 @@ class Runner(Protocol):
 
     @property
     def station(self) -> Station:
-        """Its neighbours, body and log."""
+        """The agent's station: neighbours, body and log."""
         ...
 
     @property

@@ -177,7 +177,7 @@ class _Flat(NamedTuple):
 
     @property
     def arrays(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-        """Begin, end and shape of each array."""
+        """Begin, end and shape of each array in the flat mail."""
         at, p = HEAD + TAIL, self.width
         for shape in ((p, p), (p,), (p, p), (p,)):
             size = int(np.prod(shape))

@@ -96,7 +96,7 @@ class Station:
         """(d,) target of the body; None before the first step."""
         self.regroup(None, part.first)
 
-    # -- who is there ------------------------------------------------------------------------------------------------------------------
+    # -- membership --------------------------------------------------------------------------------------------------------------------
 
     @property
     def present(self) -> list[str]:
@@ -164,7 +164,7 @@ class Station:
         """Whether the agent knows a final result: all are satisfied, or the team is infeasible and near its best margin."""
         return self.satisfied or (self._known == "infeasible" and self._near)
 
-    # -- what constraints it has -------------------------------------------------------------------------------------------------------
+    # -- constraints -------------------------------------------------------------------------------------------------------------------
 
     @float64
     def change(self, state: Any, constraint: str, parameters: Mapping[str, Any]) -> Any:
@@ -295,7 +295,7 @@ class Station:
         now = self.clock()
         return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
 
-    # -- time and place --------------------------------------------------------------------------------------------------------------------
+    # -- time and position -----------------------------------------------------------------------------------------------------------------
 
     @property
     def timed(self) -> bool:
@@ -323,7 +323,7 @@ class Station:
             return np.full(self.part.team.dimension, np.nan)
         return position
 
-    # -- the log ---------------------------------------------------------------------------------------------------------------------------
+    # -- log and reports -------------------------------------------------------------------------------------------------------------------
 
     def log(self, event: str, **details: Any) -> None:
         """Log one event."""

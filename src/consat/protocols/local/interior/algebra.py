@@ -11,18 +11,18 @@ LOOPED = 16
 
 
 def product(left: Array, right: Array) -> Array:
-    """(i, k, A), (k, j, A) → (i, j, A)."""
+    """Matrix product in every lane: (i, k, A), (k, j, A) → (i, j, A)."""
     found = jnp.matmul(jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0))
     return jnp.moveaxis(found, 0, -1)
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """(N, N, A), (N, A) → (N, A)."""
+    """Matrix-vector product in every lane: (N, N, A), (N, A) → (N, A)."""
     return jnp.sum(matrix * vector[None], axis=1)
 
 
 def gram(weight: Array, vectors: Array) -> Array:
-    """(N, N, A) Σ_k w_k v_k v_kᵀ from (m, A) and (m, N, A)."""
+    """(N, N, A) Σ_k w_k v_k v_kᵀ. `weight`: (m, A) w_k; `vectors`: (m, N, A) v_k."""
     weighted = weight[:, None] * vectors
     if vectors.size * vectors.shape[1] <= 2**22:
         return jnp.sum(weighted[:, :, None] * vectors[:, None], axis=0)
@@ -34,8 +34,8 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
     """Solve a symmetric positive definite system in every lane.
 
     Args:
-        matrix: (N, N, A).
-        right: (N, r, A).
+        matrix: (N, N, A) matrices.
+        right: (N, r, A) right-hand sides.
 
     Returns:
         (N, r, A) the solutions, and (A,) whether the matrix is positive definite.

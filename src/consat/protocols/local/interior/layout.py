@@ -269,6 +269,8 @@ ALIKE = 2**19
 
 
 class _Group(NamedTuple):
+    """Agents of one batch, and the padded sizes n, g and p; see `Batch`."""
+
     agents: np.ndarray
     n: int
     g: int
@@ -276,7 +278,13 @@ class _Group(NamedTuple):
 
 
 def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
-    """Sort the agents of a team into batches of like shape."""
+    """Sort the agents of a team into batches of similar size.
+
+    Args:
+        team: the team.
+        copies: the layout of estimates.
+        shared: the variables that neighbours share.
+    """
     count, d = team.count, team.dimension
     first = np.searchsorted(copies.holder, np.arange(count + 1))
     held = np.diff(first)
@@ -284,7 +292,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     size = shared.sizes(d)
     widest = np.ones(count, dtype=np.int64)
     np.maximum.at(widest, shared.pairs[:, 0], size)
-    power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # up to 8, 32, 128, …
+    power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # size classes up to 8, 32, 128, …
     if count * max(degree.max(initial=0), 1) * (held.max(initial=0) * d + 1) ** 2 <= ALIKE:
         power[:] = 0
     forms = [form_of(family, d) for family in team.families]

@@ -148,7 +148,7 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
     row_start = agent_start = 0
     batches = []
     for one in made:
-        flat = one.rows.ravel()  # chunk by chunk, row by row, agent by agent: the order of answers
+        flat = one.rows.ravel()  # ordered by chunk, row, agent, as the results are
         inside = flat < count
         rows[flat[inside]] = row_start + np.flatnonzero(inside)
         agents[one.agents.ravel()] = agent_start + np.arange(one.agents.size)
@@ -281,6 +281,8 @@ def _bend(family: Family, dimension: int) -> Matrix | None:
 
 @dataclass(frozen=True)
 class _Made:
+    """A batch whose agents and rows are still NumPy arrays; see `Batch`."""
+
     agents: np.ndarray
     rows: np.ndarray
     kinds: tuple[Kind, ...]

@@ -37,11 +37,11 @@ class Dense(NamedTuple):
     convex: bool
 
     def diagonal(self) -> Array:
-        """(N, A)."""
+        """(N, A) diagonal of ∇²L."""
         return jnp.stack([self.whole[i, i] for i in range(len(self.whole))])
 
     def absolute(self, numbers: Array) -> Array:
-        """(N, A) Σ_j |∇²L|_ij r_j."""
+        """(N, A) Σ_j |∇²L|_ij r_j. `numbers`: (N, A) r."""
         return add_up(jnp.abs(jnp.moveaxis(self.whole, 1, 0)) * numbers[:, None])
 
     def solve(self, kappa: Array, multiplier: Array, right: Array) -> Array:
@@ -84,12 +84,12 @@ class Alike(NamedTuple):
     d: int
 
     def diagonal(self) -> Array:
-        """(N, A)."""
+        """(N, A) diagonal of ∇²L."""
         own = jnp.stack([self.block[i // self.d, i // self.d] for i in range(self.d * len(self.block))])
         return add_up([own, *(weight[None] * a**2 for weight, a in self.directions)])
 
     def absolute(self, numbers: Array) -> Array:
-        """(N, A) an upper bound on Σ_j |∇²L|_ij r_j."""
+        """(N, A) an upper bound on Σ_j |∇²L|_ij r_j. `numbers`: (N, A) r."""
         rows = numbers.reshape(-1, self.d, numbers.shape[-1])
         own = add_up(jnp.abs(jnp.moveaxis(self.block, 1, 0))[:, :, None] * rows[:, None]).reshape(numbers.shape)
         return add_up([own, *((weight * dot(jnp.abs(a), numbers))[None] * jnp.abs(a) for weight, a in self.directions)])
