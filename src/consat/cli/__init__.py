@@ -1,4 +1,7 @@
-"""The command line: words in and words out, no mathematics. `commands` has those of one process, `network` those of many."""
+"""The command line: parses arguments and prints results, without computations.
+
+`commands` has the commands of a single process, `network` those of agents on a network.
+"""
 
 from consat.cli.commands import main
 

@@ -1,4 +1,4 @@
-"""The command line: no mathematics, only words in and words out. JSON alone on stdout; progress, logs and errors on stderr."""
+"""The command line: parses arguments and prints results. Only results and JSON go to stdout; progress, logs and errors go to stderr."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ if TYPE_CHECKING:
     from consat.scenario import Scenario
 
 PATIENCE = 2000
-"""Rounds, or seconds of a flow, that a run may take when nobody says."""
+"""Default limit of a run, in rounds or in seconds of a flow."""
 
 
 def main() -> NoReturn:
     """Entry point of the ``consat`` command."""
-    gc.set_threshold(10_000)  # by default a sixth of a short run is spent looking for garbage among what JAX builds
+    gc.set_threshold(10_000)  # with the default threshold a sixth of a short run is spent in garbage collection
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]
     try:
@@ -78,7 +78,7 @@ def main() -> NoReturn:
         _complain(f"consat: {error.filename or ''}: {error.strerror or error}")
         sys.exit(FAILED)
     finally:
-        gc.freeze()  # else Python looks through all of JAX for garbage before it ends
+        gc.freeze()  # skips the garbage collection of all of JAX at exit
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -182,7 +182,7 @@ def run(
     """Run the distributed protocol."""
     _cache_compilations()
     if not _meet(*(settings.pop(name) for name in ("processes", "coordinator", "process", "of"))):
-        quiet, as_json = True, False  # process 0 speaks for all
+        quiet, as_json = True, False  # only process 0 prints
     out = settings["out"] = resume or settings["out"]
     _fit_together(scenario, resume, out, settings["checkpoint"])
     loaded = None if scenario is None else _load(scenario, overrides)
@@ -205,7 +205,7 @@ def run(
 
 
 def _meet(processes: int | None, coordinator: str | None, process: int | None, of: int | None) -> bool:
-    """Join the others, or start them; whether this process is the one that speaks."""
+    """Join the other processes, or start them. Returns whether this process prints the result."""
     if processes is None and not {coordinator, process, of} - {None} and "CONSAT_COORDINATOR" not in os.environ:
         return True
     from consat import processes as together
@@ -366,7 +366,7 @@ def animate(result: Path, out: Path | None) -> None:
 
 
 def _file(result: Path) -> Path:
-    """The result file, where the directory of a run may be given for it."""
+    """Path of the result file, given that file or the directory of a run."""
     from consat.results.result import RESULT
 
     return result / RESULT if result.is_dir() else result
@@ -384,14 +384,20 @@ def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:
 
 
 def _cache_compilations() -> None:
-    """Keep compiled programs between runs, in the user's own cache directory; must come before JAX starts."""
-    os.environ.setdefault("EQX_ON_ERROR", "nan")  # its error callback would forbid caching; the results carry their own status
+    """Keep compiled programs between runs, in the user's cache directory. Must be called before JAX starts."""
+    os.environ.setdefault("EQX_ON_ERROR", "nan")  # the error callback of Equinox prevents caching; results carry their own status
     keep_compilations(os.environ)
 
 
 @contextmanager
 def _progress(quiet: bool, total: float | None = None, *, share: bool = False) -> Iterator[Callable[[float, float | None], None]]:
-    """A bar on stderr, where that is a terminal; with its rate, if it is known of how many rounds, or seconds of a flow, it tells."""
+    """Progress bar on stderr, if that is a terminal. Yields a function of the fraction done and the margin.
+
+    Args:
+        quiet: whether to show nothing.
+        total: number of rounds, or seconds of a flow, for the displayed rate; `PATIENCE` if None.
+        share: whether the second argument is the fraction of satisfied runs instead of the margin.
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
         return
@@ -424,7 +430,7 @@ def _say_auxiliary(radius: float, binding: list[str]) -> None:
 
 
 def _show(parts: Iterable[Any]) -> None:
-    """Rich text on stdout; as wide as its content where that is no terminal."""
+    """Print rich text on stdout; with a fixed width of 160 characters if stdout is not a terminal."""
     from rich.console import Console
 
     console = Console() if sys.stdout.isatty() else Console(width=160)

@@ -1,4 +1,4 @@
-"""What a shell offers after TAB: packaged scenarios and files, results, protocols, agents' names."""
+"""Shell completion: packaged scenarios and files, results, protocols, ids of agents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from consat.errors import ConsatError
 
 FILES: Final = (".yaml", ".yml")
 MOST: Final = 200
-"""Agents that are offered."""
+"""Largest number of agents that are offered."""
 
 
 def scenarios(context: click.Context, parameter: click.Parameter, text: str) -> list[CompletionItem]:
@@ -46,17 +46,17 @@ def _files(text: str, endings: tuple[str, ...]) -> list[CompletionItem]:
 
 
 def protocols(context: click.Context, parameter: click.Parameter, text: str) -> list[CompletionItem]:
-    """The kinds of protocols."""
+    """Names of protocols."""
     from consat.settings import ProtocolKind
 
     return [CompletionItem(kind) for kind in get_args(ProtocolKind) if kind.startswith(text)]
 
 
 def agents(context: click.Context, parameter: click.Parameter, text: str) -> list[CompletionItem]:
-    """The agents of the scenario on the command line; after a comma, those that are not named yet."""
+    """Ids of the agents of the scenario on the command line; after a comma, those that are not listed yet."""
     from consat.scenario import load
 
-    scenario = context.params.get("scenario") or next(iter(context.args), None)  # the latter where the option's own value is to come
+    scenario = context.params.get("scenario") or next(iter(context.args), None)  # in `args` while the option has no value yet
     if not isinstance(scenario, str):
         return []
     try:

@@ -1,4 +1,4 @@
-"""``consat doctor``: what a bug report needs, and what is missing here."""
+"""``consat doctor``: information for bug reports, and checks of the installation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXTRAS: Final[Mapping[str, Sequence[str]]] = {
     "network": ("cryptography", "eclipse-zenoh"),
     "video": ("av",),
 }
-"""Of each extra the libraries that it installs."""
+"""For each extra the libraries that it installs."""
 PORT: Final = 7447
 
 
@@ -38,7 +38,7 @@ def _version(library: str) -> str | None:
 
 
 def device() -> str:
-    """What JAX computes on, such as ``cpu``; why not, if it cannot."""
+    """The devices of JAX, such as ``1 × cpu (cpu)``; the reason if there are none."""
     import jax
 
     try:
@@ -50,14 +50,14 @@ def device() -> str:
 
 
 def show_version(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    """The callback of ``--version``."""
+    """Callback of ``--version``: print the versions and exit."""
     if value and not context.resilient_parsing:
         click.echo(f"consat {__version__}, JAX {_version('jax')} on {device()}, Python {platform.python_version()}")
         context.exit()
 
 
 def _compiles() -> float | None:
-    """Seconds that a small program takes to compile and run, None if it does not run."""
+    """Time, s, to compile and run a small program; None if it does not run."""
     import jax
     import jax.numpy as jnp
 
@@ -80,7 +80,7 @@ def _cache() -> dict[str, Any]:
 
 
 def _loopback() -> dict[str, Any]:
-    """Whether processes of this machine can reach each other, and whether the first agent's port is free."""
+    """Whether processes of this machine can reach each other over loopback, and whether the first agent's port is free."""
     reaches = free = True
     try:
         with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()[:2], timeout=2.0) as client:
@@ -98,7 +98,7 @@ def _loopback() -> dict[str, Any]:
 
 
 def findings() -> dict[str, Any]:
-    """Everything, as ``--json`` prints it (schema consat.doctor/1)."""
+    """The document that ``--json`` prints (schema consat.doctor/1)."""
     cache = _cache()
     return {
         "schema": SCHEMA,

@@ -1,4 +1,4 @@
-"""Examples that ``--help`` of each command ends with."""
+"""Examples at the end of the ``--help`` of each command."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
     "split": ("consat split case-b --out parts", "consat split case-b --out parts --address a2=tcp/192.168.0.7:7447"),
     "sweep": ("consat sweep case-b --seeds 100", "consat sweep case-b --over loss=0,0.1,0.3 --seeds 20 --out runs/loss"),
 }
-"""Of each command."""
+"""For each command its examples."""
 
 
 def add_examples(group: click.Group) -> None:
-    """End the help of every command with its examples, as they are, unwrapped."""
+    """Add its examples, unwrapped, to the end of the help of every command of the group."""
     for name, lines in EXAMPLES.items():
         if name in group.commands:
             group.commands[name].epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)

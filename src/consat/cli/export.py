@@ -1,4 +1,4 @@
-"""``consat export`` and ``consat show``: a saved result as a file of another kind."""
+"""``consat export`` and ``consat show``: write a saved result in another format."""
 
 from __future__ import annotations
 

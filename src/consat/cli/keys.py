@@ -1,4 +1,4 @@
-"""``consat keys``."""
+"""``consat keys``: make keys and certificates for the agents of a team."""
 
 from __future__ import annotations
 

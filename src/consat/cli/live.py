@@ -1,4 +1,4 @@
-"""``consat live``: the team on a page."""
+"""``consat live``: show and control a team in a web page."""
 
 from __future__ import annotations
 

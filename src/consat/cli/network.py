@@ -1,4 +1,4 @@
-"""``consat split``, ``consat agent`` and ``consat launch``: no more than words in and words out."""
+"""``consat split``, ``consat agent`` and ``consat launch``: parse the arguments and print the results."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ keys_option = click.option(
 
 
 class _Delay(click.ParamType[tuple[float, float]]):
-    """``S`` or ``A,B``, seconds."""
+    """Type of an option: a delay ``S`` or a range of delays ``A,B``, s."""
 
     name = "S | A,B"
 
@@ -75,7 +75,7 @@ class _Delay(click.ParamType[tuple[float, float]]):
 
 
 class _Position(click.ParamType[tuple[float, ...]]):
-    """Numbers with commas between them."""
+    """Type of an option: numbers separated by commas."""
 
     name = "X,Y"
 
@@ -251,7 +251,7 @@ def launch(
 
 
 def _with(scenario: Any, protocol: str | None, estimates: str | None, seed: int | None) -> Any:
-    """The scenario with what the command line says instead."""
+    """Copy of the scenario with the settings of the command line; None leaves a setting unchanged."""
     import dataclasses
 
     asked = scenario.settings
@@ -266,7 +266,7 @@ def _with(scenario: Any, protocol: str | None, estimates: str | None, seed: int 
 
 
 def _part(file: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any) -> Part:
-    """The agent's own part, of a private file or of a scenario, which is split as suits the mode."""
+    """The part of an agent: read from its private file, or split from a scenario for the protocol of the mode."""
     from consat.errors import InvalidSettings, closest
     from consat.network.node.modes import protocol_of
     from consat.network.node.part import is_part, load_text, read_part, split
@@ -290,7 +290,11 @@ def _part(file: str, agent: str, overrides: tuple[str, ...], port: int, mode: An
 
 
 def _keys(given: Path | None, file: str, agents: Any) -> Path | None:
-    """The folder of the keys: as given, or the one beside FILE. Where there are some, no agent goes without."""
+    """Folder of the keys: the given one, or ``keys`` beside FILE if it exists; None without keys.
+
+    Raises:
+        NetworkError: the folder beside FILE has no keys for one of the agents.
+    """
     from consat.errors import NetworkError
     from consat.network.keys import CA, KEY
     from consat.network.names import spelled
@@ -300,7 +304,7 @@ def _keys(given: Path | None, file: str, agents: Any) -> Path | None:
     beside = Path(file).parent / "keys"
     if not (Path(file).is_file() and (beside / CA).is_file()):
         return None
-    own = len(agents) == 1 and (beside / KEY).is_file()  # the folder of that one agent, not of the team
+    own = len(agents) == 1 and (beside / KEY).is_file()  # a folder with the keys of this agent only
     if lacking := [repr(agent) for agent in agents if not own and not (beside / spelled(agent)).is_dir()]:
         raise NetworkError(
             f"there are keys in {beside}, but none of {', '.join(lacking)}; make them (consat keys … --out {beside}), or say --keys"

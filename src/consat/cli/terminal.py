@@ -1,4 +1,4 @@
-"""What all commands have in common: arguments, exit codes, and how a run is told."""
+"""Shared by all commands: arguments, options, exit codes, and the printing of a result."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 @contextmanager
 def located(scenario: Scenario | None) -> Iterator[None]:
-    """Faults that show only later, such as a cluster without links, get their place in the file."""
+    """Add the location in the scenario file to faults that are found after parsing, such as a cluster without links."""
     from consat.scenario import located as in_file
 
     try:
@@ -44,7 +44,7 @@ def located(scenario: Scenario | None) -> Iterator[None]:
 
 
 def tell(result: Result, *, quiet: bool, as_json: bool) -> int:
-    """Print what came out; gives the exit code."""
+    """Print a result. Returns the exit code."""
     if as_json:
         click.echo(json.dumps(result.summary))
     elif not quiet:

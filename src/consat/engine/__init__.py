@@ -1,10 +1,10 @@
-"""All agents of a team in one process: a protocol's function of one agent, mapped over everybody's copies at once.
+"""Simulation of all agents of a team: the per-agent functions of a protocol, applied to the copies of all agents at once.
 
-In: a team, a layout of copies, a protocol of `consat.protocols`. Out: a `consat.results.trace.Trace`. Begin with `round`, one round of all;
-`chunks` repeats it on the device, `loop` records and stops. May not import `consat.runs`, `consat.network`.
+Input: a team, a layout of copies, a protocol of `consat.protocols`. Output: a `consat.results.trace.Trace`. Start reading at `round`, one
+round of all agents; `chunks` repeats it on the device, `loop` records and stops. Must not import `consat.runs` or `consat.network`.
 """
 
 from typing import Literal
 
 Stop = Literal["satisfied", "converged", "never"]
-"""When to end before the time or the rounds are up."""
+"""Condition that ends a run before its limit of time or rounds."""

@@ -1,7 +1,7 @@
-"""Many runs in rounds as one computation: a pool of lanes, each a run of its own, in which the next run takes the place of one that ended.
+"""Many runs in rounds as one vectorised computation: a pool of lanes, one run in each. When a run ends, the next one takes its place.
 
-A lane ends at the very round at which the same run would end by itself: lanes that have ended wait, frozen, for the rest of a chunk of
-rounds, and then give their place away, so that no run waits for the slowest one.
+A run in a lane ends at the same round as it would alone. It is frozen for the rest of the chunk of rounds, then its place in the pool is
+given to a waiting run, so that no run waits for the slowest one.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending
 
 LANES = 32
-"""The most lanes of a pool, …"""
+"""Largest number of lanes in a pool."""
 NUMBERS = 2**17
-"""… of which all estimates together should be no more numbers than stay in a cache."""
+"""Largest number of floats in the estimates of all lanes, chosen to fit in a cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What many runs share but for starts and luck.
+    """Settings that runs share when only their starts and random seeds differ.
 
     Attributes:
-        world: what does not change in a run.
+        world: data that is constant during a run.
         gains: fields of the protocol that differ between cases.
-        rules: when a run ends.
-        then: how runs go on that go over to another layout of copies; None if none does.
+        rules: stop rules.
+        then: how runs continue that switch to another layout of copies; None if none does.
     """
 
     world: World
@@ -50,12 +50,12 @@ class Case:
 
 
 class Then(NamedTuple):
-    """Another layout of copies.
+    """Switch to another layout of copies.
 
     Attributes:
-        before: the layout until then.
-        after: the layout from then on.
-        case: gives what is run from then on, always the same; made when it is first asked for.
+        before: the layout before the switch.
+        after: the layout after the switch.
+        case: returns the case after the switch, the same object every time; built at the first call.
     """
 
     before: Estimates
@@ -68,10 +68,10 @@ class Lane:
     """One run.
 
     Attributes:
-        case: what is run.
-        first: (C, d) first estimates.
-        seed: of what goes wrong.
-        tally: of the rounds before, of a run that goes on; None of one that begins.
+        case: settings of the run.
+        first: (C, d) initial estimates.
+        seed: random seed of message loss and faults.
+        tally: counters before the switch, for a run that continues; None for a new run.
     """
 
     case: Case
@@ -81,7 +81,7 @@ class Lane:
 
 
 class Outcome(NamedTuple):
-    """What became of a run: counts, everyone's last positions (N, d) and estimates (C, d), and why it ended."""
+    """Result of a run: counters, final positions, (N, d), final estimates, (C, d), and the reason why it ended."""
 
     tally: Tally
     positions: np.ndarray
@@ -90,22 +90,22 @@ class Outcome(NamedTuple):
 
 
 def like(case: Case) -> Hashable:
-    """Cases of which this is equal run as one computation."""
+    """Key of a case; cases with equal keys can run as one computation."""
     leaves, structure = jax.tree.flatten(case.world)
     return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(case.gains), case.rules.stop
 
 
 @float64
 def simulate_batch(protocol: Rounds, lanes: Sequence[Lane], progress: Callable[[float, float], None] = lambda *_: None) -> list[Outcome]:
-    """Run lanes whose cases are alike.
+    """Run lanes whose cases have equal keys; see `like`.
 
     Args:
-        protocol: of all.
-        lanes: in any order.
-        progress: called with the fraction of the runs that have ended, and the share of these that ended satisfied.
+        protocol: protocol of all runs.
+        lanes: the runs.
+        progress: called with the fraction of the runs that have ended, and the fraction of these that ended satisfied.
 
     Returns:
-        the outcomes, in the same order.
+        The outcomes, in the order of `lanes`.
     """
     cases = list({id(lane.case): lane.case for lane in lanes}.values())
     shared = _Shared.of(protocol, cases)
@@ -125,7 +125,7 @@ def simulate_batch(protocol: Rounds, lanes: Sequence[Lane], progress: Callable[[
 
 
 def _go_on(protocol: Rounds, lanes: Sequence[Lane], outcomes: dict[int, Outcome]) -> None:
-    """Runs whose time was not up go on over another layout of copies."""
+    """Continue the runs that switch to another layout of copies, and replace their outcomes."""
     groups: dict[Hashable, list[tuple[int, Lane]]] = defaultdict(list)
     for k, lane in enumerate(lanes):
         then, found = lane.case.then, outcomes[k]
@@ -139,14 +139,14 @@ def _go_on(protocol: Rounds, lanes: Sequence[Lane], outcomes: dict[int, Outcome]
 
 
 class _Varied(NamedTuple):
-    """What of a world, and of the gains, differs between cases: arrays with the cases, or the lanes, along their first axis."""
+    """The leaves of a world and the gains that differ between cases; arrays whose first axis is the case or the lane."""
 
     leaves: tuple[Array, ...]
     gains: Mapping[str, Array]
 
 
 class _Plan(NamedTuple):
-    """What a computation is compiled for: the protocol, the structure of the worlds, and which of their leaves differ."""
+    """Static argument of the compiled computation: protocol, tree structure of the worlds, and indices of the leaves that differ."""
 
     protocol: Rounds
     structure: Any
@@ -162,12 +162,12 @@ class _Plan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """Cases that are alike.
+    """Cases with equal keys.
 
     Attributes:
-        plan: what they are compiled as.
-        fixed: the leaves of a world that do not differ.
-        varied: those that do, stacked.
+        plan: static argument of the computation.
+        fixed: the leaves of a world that are the same in all cases.
+        varied: the leaves that differ, stacked.
     """
 
     plan: _Plan
@@ -188,7 +188,7 @@ class _Shared:
 
 
 class _Pool:
-    """The lanes that run now; a place of the pool that nobody needs any more holds a lane that does nothing."""
+    """The lanes that run now. A place of the pool that is not needed any more holds a lane that advances by 0 rounds."""
 
     def __init__(self, shared: _Shared, lanes: Sequence[Lane], of_lane: np.ndarray, size: int) -> None:
         self._shared, self._lanes, self._of_lane, self._size = shared, lanes, of_lane, size
@@ -204,7 +204,7 @@ class _Pool:
         self._estimates: np.ndarray | None = None
 
     def fill(self) -> None:
-        """Let waiting lanes start where there is place."""
+        """Start waiting lanes in the free places of the pool."""
         places = [place for place in range(self._size) if place not in self.running][: len(self.waiting)]
         if not places:
             return
@@ -227,7 +227,7 @@ class _Pool:
                 tally.add(_row(chunk, place))
 
     def advance(self) -> list[int]:
-        """A chunk of rounds of every lane; gives the lanes that have ended."""
+        """Advance every lane by one chunk of rounds. Returns the lanes that have ended."""
         number, rounds, streak, hold, most, near, knowing = (np.zeros(self._size, dtype=np.int64) for _ in range(7))
         for place, lane in self.running.items():
             tally, rules = self.tallies[lane], self._lanes[lane].case.rules
@@ -250,7 +250,7 @@ class _Pool:
         return ended
 
     def outcome(self, lane: int) -> Outcome:
-        """Of a lane that has ended; its place is free."""
+        """Outcome of a lane that has ended; frees its place."""
         place = next(place for place, other in self.running.items() if other == lane)
         del self.running[place]
         assert self._positions is not None

@@ -1,7 +1,7 @@
-"""What agents remember, carried over to a team of another structure: agents, constraints or links have come or gone.
+"""Transfer of a protocol's state to a team of another structure, after agents, constraints or links were added or removed.
 
-Everything an agent remembers has one row of something: a copy, a constraint, a neighbour, an end of a link, itself. What was there before
-under the same name keeps what is remembered of it; what is new begins as at a start.
+Every array of the state has one row for each copy, constraint, neighbour, end of a link, or agent. A row whose name existed before keeps
+its values; a new row has the values of an initial state.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Names:
-    """What the rows of everything that agents remember are called, whatever their order.
+    """Names of the rows of a state, which do not depend on their order.
 
     Attributes:
-        row: (C,) of each copy: its holder and whose position it is.
-        agent: (N,).
-        constraint: (M,) family after family: owner and name.
-        link: (E,) of each end: the copy, and who is at the other end.
-        pair: (P,) of each neighbour: both, and what they share.
+        row: (C,) for each copy: holder and owner of the position.
+        agent: (N,) ids.
+        constraint: (M,) for each constraint, family after family: owner and name.
+        link: (E,) for each end of a link: the copy, and the agent at the other end.
+        pair: (P,) for each directed pair of neighbours: both agents, and the variables that they share.
     """
 
     row: Sequence[Any]
@@ -43,7 +43,7 @@ class Names:
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, *, pairs: bool) -> Names:
-        """Of a team whose copies are laid out; pairs: whether its protocol speaks to neighbours as a whole."""
+        """Names for a team and its layout of copies. `pairs`: whether the protocol sends one message per pair of neighbours."""
         ids = list(team.ids)
         row = [(ids[i], ids[j]) for i, j in zip(copies.holder.tolist(), copies.position.tolist(), strict=True)]
         numbers = [int(k) for family in team.families for k in family.number]
@@ -64,14 +64,14 @@ def _pairs(ids: Sequence[str], copies: Estimates) -> list[Any]:
 
 
 def carried(per: Mapping[str, Any], old: Any, new: Any, before: Names, after: Names) -> Any:
-    """The new state, with what the old one remembers of whatever is in both.
+    """The new state, with the rows of the old state whose names occur in both.
 
     Args:
-        per: what each field has one of; see `consat.protocols.Rounds`.
-        old: the state of the protocol before.
-        new: a state to begin with after.
-        before: the names of its rows before.
-        after: likewise after.
+        per: leading axis of each field; see `consat.protocols.Rounds.per`.
+        old: state of the protocol before the change.
+        new: initial state of the protocol after the change.
+        before: names of the rows of `old`.
+        after: names of the rows of `new`.
     """
     places = {kind: _places(getattr(before, kind), getattr(after, kind)) for kind in ("row", "agent", "constraint", "link", "pair")}
 
@@ -84,7 +84,7 @@ def carried(per: Mapping[str, Any], old: Any, new: Any, before: Names, after: Na
 
 
 def _places(before: Sequence[Any], after: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Where in `before` and where in `after` what is in both stands."""
+    """Indices in `before` and in `after` of the names that occur in both."""
     known = {name: k for k, name in enumerate(before)}
     both = [(known[name], k) for k, name in enumerate(after) if name in known]
     here, there = np.array(both, dtype=np.int64).reshape(-1, 2).T
@@ -92,7 +92,7 @@ def _places(before: Sequence[Any], after: Sequence[Any]) -> tuple[np.ndarray, np
 
 
 def _merged(old: Any, new: Any, places: tuple[np.ndarray, np.ndarray]) -> Any:
-    """The new rows, with the old ones where they were; of wider ones what fits."""
+    """The new array, with rows of the old one at `places`; where the rows have different shapes, the common part is copied."""
     here, there = places
     kept, merged = np.asarray(old)[here], np.array(new)
     fits: Any = tuple(slice(min(a, b)) for a, b in zip(kept.shape[1:], merged.shape[1:], strict=True))
@@ -101,7 +101,15 @@ def _merged(old: Any, new: Any, places: tuple[np.ndarray, np.ndarray]) -> Any:
 
 
 def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence[str], after: Sequence[str]) -> Driven:
-    """Robots of a team of other members: those who stay go on as they were, and what came of it so far stays."""
+    """Transfer the state of the robots to a team with other members. Remaining robots keep their state, and the report is continued.
+
+    Args:
+        model: model of the new robots.
+        old: the robots before the change.
+        new: initial state of the robots after the change.
+        before: ids of the old robots.
+        after: ids of the new robots.
+    """
     from consat.robots import Fleet
 
     report = new.memory.report._replace(
@@ -115,7 +123,7 @@ def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence
 
 
 def robot_placed(model: Model[Any], state: Any, i: int, place: np.ndarray) -> Any:
-    """The state of robots of which one, i, is now at rest at its place among (N, d)."""
+    """The state of the robots with robot `i` at rest at ``place[i]``. `place`: (N, d) positions."""
     from consat.robots import Fleet
 
     if isinstance(model, Fleet):

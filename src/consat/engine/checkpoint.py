@@ -1,4 +1,4 @@
-"""The state of a run on disk, so that it can be taken up again bit for bit; plain arrays by name, never pickled."""
+"""Checkpoints: the state of a run on disk, from which it resumes bit for bit. The file holds named arrays and JSON, no pickles."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from consat.problem.team import Team
 SCHEMA = "consat.checkpoint/2"
 NAME = "checkpoint.npz"
 SHARE = 0.05
-"""Of the time of a run, that writing checkpoints may take at most."""
+"""Largest fraction of a run's time for writing checkpoints."""
 _META = "meta"
 
 
 @dataclasses.dataclass
 class Checkpoint:
-    """Where and how often to write one.
+    """Writes checkpoints, and restores the state of the run to resume.
 
     Attributes:
-        path: of the file.
-        seconds: between two, at least.
-        about: what else must be known to go on; plain data.
-        taken_up: what an earlier run left, or None.
+        path: path of the file.
+        seconds: smallest time between two checkpoints, s.
+        about: metadata needed to resume the run; JSON-serialisable.
+        taken_up: arrays and metadata of the checkpoint to resume from; None for a new run.
     """
 
     path: Path
@@ -45,20 +45,20 @@ class Checkpoint:
 
     @property
     def turned(self) -> bool:
-        """Whether the run that is taken up had gone over to another layout of copies, see `consat.engine.rounds.Turn`."""
+        """Whether the run to resume had switched to another layout of copies; see `consat.engine.rounds.Turn`."""
         return self.taken_up is not None and self.taken_up[1]["tally"].get("turned") is not None
 
     def due(self) -> bool:
-        """Whether the last one has become old."""
+        """Whether it is time for the next checkpoint."""
         return time.monotonic() >= self._next
 
     def write(self, state: Any, tally: Mapping[str, Any], problem: str) -> None:
-        """Replace the last one, at once or not at all.
+        """Write a checkpoint, which replaces the last one atomically.
 
         Args:
             state: a pytree of arrays.
-            tally: counts, as plain data and arrays.
-            problem: `fingerprint` of what is run.
+            tally: counters: scalars and arrays.
+            problem: `fingerprint` of the run.
         """
         began = time.monotonic()
         arrays = {name: np.asarray(_plain(leaf)) for name, leaf in _named(state).items()}
@@ -73,14 +73,14 @@ class Checkpoint:
         self._next = now + max(self.seconds, (now - began) / SHARE)
 
     def restore(self, like: Any, problem: str) -> tuple[Any, Mapping[str, Any]] | None:
-        """The state and the tally of the run that is taken up, or None if none is.
+        """State and counters of the run to resume; None for a new run.
 
         Args:
-            like: a pytree of the same structure, shapes and types.
-            problem: `fingerprint` of what is run.
+            like: a state with the same structure, shapes and types.
+            problem: `fingerprint` of the run.
 
         Raises:
-            InvalidResult: the checkpoint is of another problem.
+            InvalidResult: the checkpoint belongs to another problem or to another version of consat.
         """
         if self.taken_up is None:
             return None
@@ -98,10 +98,10 @@ class Checkpoint:
 
 
 def read(path: Path) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
-    """The arrays of a checkpoint, and what else it holds.
+    """Arrays and metadata of a checkpoint file.
 
     Raises:
-        InvalidResult: there is none, or it cannot be read.
+        InvalidResult: the file is missing or not a readable checkpoint of this schema.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -118,18 +118,18 @@ def read(path: Path) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
 
 
 def scenario(path: Path) -> str | None:
-    """The name of the scenario whose checkpoint it is, None if it does not say; errors as of `read`, or of what is no checkpoint."""
+    """Name of the scenario of a checkpoint; None if it has none. Other files raise the errors of `open`, `np.load` or `json.loads`."""
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         name: str | None = json.loads(file[_META].tobytes()).get("scenario_name")
     return name
 
 
 def fingerprint(team: Team, *parts: Any) -> str:
-    """A hash of the team's numbers and of everything else that decides what a run does.
+    """Hash of the team's data and of everything else that determines a run.
 
     Args:
         team: the team.
-        parts: arrays, and whatever has a telling `repr`.
+        parts: arrays, and objects whose `repr` shows all their data.
     """
     digest = hashlib.sha256()
 
@@ -162,5 +162,5 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _plain(leaf: Any) -> Any:
-    """The numbers of a leaf; of a random key its data."""
+    """A leaf as a plain array; the key data of a random key."""
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf

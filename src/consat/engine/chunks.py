@@ -1,4 +1,4 @@
-"""Who carries out the rounds, a chunk at a time: a program on the device, so that nothing waits for Python between two rounds."""
+"""Engine that computes rounds in chunks: one compiled loop on the device, without Python between two rounds."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
     from consat.engine.ways import Ways
 
 CHUNK = 10
-"""Rounds between two looks at the stop rule and the progress bar."""
+"""Number of rounds between two checks of the stop rules and updates of the progress bar."""
 LARGE = 200_000
-"""Of more agents than these the rounds take longer than their program takes to compile well."""
+"""Number of agents above which the program is compiled with full optimization, because the rounds then take longer than the compiler."""
 SURE = 3
-"""For so many rounds on end all must know what ends a run: what they have heard of the others' margins is some rounds old."""
+"""Number of consecutive rounds for which all agents must know the result that ends a run, because received margins are some rounds old."""
 NEVER = 2**62
-"""More rounds than there are."""
+"""A number of rounds that is never reached."""
 SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats")
-"""Of what is seen of a round, the numbers that every chunk tells."""
+"""Fields of `Seen` that every chunk reports for each round."""
 
 
 class Kept(NamedTuple):
-    """What is recorded of a round, or with a leading axis of several.
+    """Record of one round; of several rounds with a leading axis.
 
     Attributes:
-        position: (R, d).
-        agent_margin: (R,).
-        estimate: (E, d), of no copies where none are recorded.
-        heading: (R,) rad; (0,) where bodies have none.
+        position: (R, d) positions of the recorded agents.
+        agent_margin: (R,) their margins.
+        estimate: (E, d) recorded estimates; E = 0 without any.
+        heading: (R,) headings, rad; (0,) for bodies without a heading.
     """
 
     position: Any
@@ -50,20 +50,20 @@ class Kept(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """What is seen of up to `CHUNK` rounds.
+    """Result of up to `CHUNK` rounds.
 
     Attributes:
-        done: how many.
-        margin: (CHUNK,) β̄ after each.
-        smooth_margin: (CHUNK,).
-        known: (CHUNK,) what everybody knew; see `consat.engine.round.knowledge`.
-        bound: (CHUNK,) on the best margin, proven by all; NaN where none is.
-        near: for how many rounds everybody has known what ends the run.
-        messages: (CHUNK,) sent.
-        floats: (CHUNK,) sent.
-        drift: how far any position was, on any axis, from where it was before; not finite if a position is not.
-        violated: (W,) after how many of them each watched constraint was violated; None where nobody counts.
-        kept: of every so manieth round, with a leading axis; what stands beyond these means nothing.
+        done: () number of rounds.
+        margin: (CHUNK,) team margin β̄ after each round.
+        smooth_margin: (CHUNK,) smooth margin after each round.
+        known: (CHUNK,) what all agents know, as bits; see `consat.engine.round.knowledge`.
+        bound: (CHUNK,) upper bound on the best margin that all agents have proven; NaN without one.
+        near: () number of consecutive rounds for which all agents have known the result that ends the run.
+        messages: (CHUNK,) number of messages sent.
+        floats: (CHUNK,) number of floats sent.
+        drift: () largest distance of a position, on any axis, from its value before the chunk; not finite if a position is not.
+        violated: (W,) number of rounds after which each watched constraint was violated; None if not counted.
+        kept: the recorded rounds, with a leading axis; entries beyond their number are meaningless.
     """
 
     done: Any
@@ -80,50 +80,50 @@ class Chunk(NamedTuple):
 
 
 class Engine(Protocol):
-    """Who carries out the rounds: this process, or several."""
+    """Computes the rounds of a run, in this process or in several."""
 
     world: World
-    """What does not change, of this process's agents."""
+    """Data of this process's agents that is constant during a run."""
 
     def start(self) -> tuple[Any, Chunk]:
-        """The state before the first round, and what is seen of it."""
+        """The state before the first round, and a chunk with that state alone."""
         ...
 
     def advance(self, state: Any, number: int, count: int, streak: tuple[int, int] | None, every: int) -> tuple[Any, Chunk]:
-        """Some rounds.
+        """Advance `state` by up to `count` rounds.
 
         Args:
-            state: given up.
-            number: of the first of them.
-            count: how many.
-            streak: for how many rounds every margin has been positive, and for how many all have known what ends the run; the rounds end
-                when either are enough, if that ends the run. None while nothing does.
-            every: each how manieth round to keep.
+            state: the state. Its buffers are donated and must not be used again.
+            number: number of the first round.
+            count: largest number of rounds.
+            streak: number of consecutive rounds for which every margin has been positive, and for which all agents have known the result
+                that ends the run. The rounds end early when one of them is large enough. None disables this.
+            every: record one round in `every`.
         """
         ...
 
     def positions(self, state: Any) -> np.ndarray:
-        """(N, d) everyone's positions."""
+        """(N, d) positions of all agents."""
         ...
 
     def look(self, state: Any, number: int) -> Kept:
-        """What is recorded of the state as it is, after so many rounds."""
+        """Record of the state after `number` rounds."""
         ...
 
     def agree(self, stop: bool) -> bool:
-        """Whether any process wants to stop."""
+        """Whether any process wants to stop. `stop`: whether this one does."""
         ...
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Chosen:
-    """Who is recorded, and what is watched.
+    """`consat.engine.recording.Choice` on the device.
 
     Attributes:
-        agents: (R,), or None for all in order.
-        copies: (E,).
-        watched: (W,) constraints.
+        agents: (R,) recorded agents; None for all.
+        copies: (E,) recorded rows.
+        watched: (W,) constraints whose violations are counted.
     """
 
     agents: Array | None
@@ -143,6 +143,8 @@ class Chosen:
 
 
 class _Loop(NamedTuple):
+    """Carry of the loop over rounds. `places`: number of recorded rounds; `told`: whether all agents know that all are satisfied."""
+
     done: Array
     now: Now
     streak: Array
@@ -163,9 +165,18 @@ def start(protocol: Rounds, world: World, chosen: Chosen, first: Array, key: Arr
 
 
 class Ask(NamedTuple):
-    """Of the arguments of `Engine.advance` the numbers; `hold`: how many satisfied rounds on end end the run, if all know it by then, and
-    `most`: how many at the latest; and `knowing`: what all must know, for `SURE` rounds on end, to end it, as bits; see
-    `consat.engine.round.knowledge`."""
+    """Scalar arguments of `advance`.
+
+    Attributes:
+        number: number of the first round.
+        rounds: largest number of rounds.
+        streak: consecutive satisfied rounds before this chunk.
+        every: record one round in `every`.
+        hold: consecutive satisfied rounds that end the run, if all agents know by then that all are satisfied.
+        most: consecutive satisfied rounds that end the run in any case.
+        near: consecutive rounds before this chunk for which all agents have known the result that ends the run.
+        knowing: results that end the run when all agents know one of them for `SURE` rounds; bits of `consat.engine.round.knowledge`.
+    """
 
     number: Array
     rounds: Array
@@ -178,7 +189,16 @@ class Ask(NamedTuple):
 
 
 def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: Now, ask: Ask) -> tuple[Now, Chunk]:
-    """Rounds until there are so many, or enough on end are satisfied; what is kept of them goes into buffers of `capacity`."""
+    """Compute rounds until `ask.rounds` are done or a stop rule holds.
+
+    Args:
+        protocol: the protocol.
+        world: constant data of the run.
+        chosen: what is recorded.
+        capacity: number of rounds in the buffers of the record.
+        now: the state. Its buffers are donated and must not be used again.
+        ask: scalar arguments.
+    """
     anchor = now.body
     real, whole = now.body.dtype, jnp.asarray(0).dtype
     d = now.body.shape[1]
@@ -204,7 +224,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
 
     def step(at: _Loop) -> _Loop:
         number = ask.number + at.done
-        here = world.at(number.astype(real) + 1.0)  # an agent's own constraints are those of the time for which it moves
+        here = world.at(number.astype(real) + 1.0)  # constraints at the end of the round
         now, seen, keep = _one(protocol, here, chosen, at.now, number)
         chunk = at.chunk
         drift = jnp.maximum(chunk.drift, jnp.max(jnp.abs(now.body - anchor), initial=0.0))
@@ -213,7 +233,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
             for name, value in zip(SCALARS, seen, strict=True)
         }
         count = chunk.violated + violated(here.observer, chosen.watched, now.body).astype(whole)
-        # what is not to be kept is overwritten by the next
+        # a round that is not recorded is overwritten by the next one
         kept = jax.tree.map(lambda buffer, value: jax.lax.dynamic_update_index_in_dim(buffer, value, at.places, 0), chunk.kept, keep)
         places = jnp.where((number + 1) % ask.every == 0, at.places + 1, at.places)
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
@@ -253,16 +273,16 @@ def _compiled(large: bool) -> tuple[Callable[..., tuple[Now, Chunk]], Callable[.
 
 
 class OneProcess:
-    """All rounds in this process.
+    """`Engine` that computes all agents in this process.
 
     Args:
-        protocol: what the agents do.
-        world: what does not change.
-        first: (C, d) first estimates.
-        seed: of what goes wrong.
+        protocol: the protocol.
+        world: constant data of the run.
+        first: (C, d) initial estimates.
+        seed: random seed of message loss and faults.
         choice: what is recorded.
-        hold: how many satisfied rounds on end are the end, at the earliest and at the latest; None if nothing of the kind is.
-        knowing: what all must know for the end; see `Ask`.
+        hold: `Ask.hold` and `Ask.most`; None if satisfied rounds do not end the run.
+        knowing: see `Ask`.
     """
 
     def __init__(
@@ -291,7 +311,7 @@ class OneProcess:
         knowing = 0 if streak is None else self._knowing
         satisfied, near = streak or (0, 0)
         asked = (number, count, satisfied, every, hold, most, near, knowing)
-        ask = Ask(*map(np.asarray, asked))  # type: ignore[arg-type]  # numpy's arrays go along with the call at no cost
+        ask = Ask(*map(np.asarray, asked))  # type: ignore[arg-type]  # numpy arrays are transferred with the call
         return _compiled(self._large)[1](self._protocol, self.world, self._chosen, self._capacity, state, ask)
 
     def positions(self, state: Now) -> np.ndarray:

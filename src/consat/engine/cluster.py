@@ -1,4 +1,4 @@
-"""The rounds of one team in several processes: the same halves of a round over each process's own agents, and one exchange between them."""
+"""Rounds of one team in several processes. Each process computes both halves of a round for its own agents, with one exchange between."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 
 PATIENCE = 600
-"""How long processes wait for one another to compile, s."""
+"""Largest time, in s, that processes wait for one another to compile."""
 
 
 class _Way(NamedTuple):
@@ -42,7 +42,7 @@ class _Way(NamedTuple):
 
 
 class _Book(NamedTuple):
-    """What is noted of the rounds of a chunk, (CHUNK, …): bodies, estimates that are recorded, and counts."""
+    """Buffers of a chunk of rounds, each with leading axis CHUNK: positions of bodies, recorded estimates, and counters."""
 
     body: Array
     estimate: Array
@@ -52,28 +52,33 @@ class _Book(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of this process's agents."""
+
     now: Now
     number: int
-    """of the round that comes next"""
+    """Number of the next round."""
 
 
 class ManyProcesses:
-    """All rounds, of which this process computes its share.
+    """`consat.engine.chunks.Engine` that runs in several processes, each of which computes its share of the agents.
 
-    Every process makes one of these, with the same arguments, once it has joined (`consat.processes`), and does the same with it.
+    Every process creates one with the same arguments after it has joined (`consat.processes`), and makes the same calls in the same order.
 
     Args:
         team: the whole team.
-        protocol: what the agents do.
+        protocol: the protocol.
         copies: the layout of estimates.
         nu: the smoothing.
-        size: the team's natural size.
-        first: (C, d) first estimates.
+        size: the team's natural scale.
+        first: (C, d) initial estimates.
         convex: whether every ψ is known to be concave.
-        weather: loss and sleep.
+        weather: message loss and sleep.
         body: how fast positions follow estimates.
         choice: what is recorded.
-        hold: how many satisfied rounds on end are the end; None if nothing of the kind is.
+        hold: number of consecutive satisfied rounds that end the run; None if they do not.
+
+    Raises:
+        InvalidSettings: there are more processes than agents.
     """
 
     def __init__(
@@ -112,7 +117,7 @@ class ManyProcesses:
         self._all = _Places.of(np.arange(team.count), part, share.agents[: share.mine], self._me, self._count)
 
     def _warm_up(self) -> None:
-        """Compile what this process computes by itself, before the others wait for it in an exchange, which they don't do for long."""
+        """Compile the local programs before the first exchange, because processes in an exchange wait only for a short time."""
         run, world, rows = _compiled(), self.world, jnp.asarray(self._rows.mine)
         now = run.begin(self._protocol, world, jnp.asarray(self._first), jax.random.key(self._seed))
         book, zero = run.empty(now, rows), jnp.asarray(0)
@@ -143,12 +148,19 @@ class ManyProcesses:
             satisfied = 0 if streak is None else streak[0]
             for k, margin in enumerate(chunk.margin[:count]):
                 satisfied = satisfied + 1 if margin > 0 else 0
-                if satisfied >= self._hold and k + 1 < count:  # it ended within the chunk: go there again
+                if satisfied >= self._hold and k + 1 < count:  # the run ends within the chunk: compute it again up to that round
                     return self.advance(state, number, k + 1, (satisfied - k - 1, 0), every)
         return _State(now, number + count), chunk
 
     def _seen(self, book: _Book, anchor: Array, kept: np.ndarray, count: int) -> Chunk:
-        """What an observer of the whole team sees of a chunk: positions cross once, then numbers."""
+        """The chunk as an observer of the whole team sees it. Positions are exchanged once, then per-process scalars are gathered.
+
+        Args:
+            book: buffers of the chunk.
+            anchor: (n, d) positions before the chunk.
+            kept: indices of the recorded rounds in the chunk.
+            count: number of rounds in the chunk.
+        """
         run = _compiled()
         into = self._exchanged(run.pack_positions(book.body, self._positions.out))
         margins, scalars = run.look(self.world, book, anchor, into, self._positions.into)
@@ -186,11 +198,11 @@ class ManyProcesses:
         return Kept(*(leaf[0] for leaf in kept))
 
     def _exchanged(self, out: Array) -> Array:
-        """(P, H, …) what goes to each process → what comes from each."""
+        """(P, H, …) items for each process → (P, H, …) items from each process."""
         return self._swap(self._shared(out)).addressable_data(0)[0]
 
     def _gathered(self, mine: Array) -> np.ndarray:
-        """(…) → (P, …) what each process has."""
+        """(…) → (P, …): the array of every process."""
         return np.asarray(self._gather(self._shared(mine)).addressable_data(0))
 
     def _shared(self, mine: Array) -> Array:
@@ -198,19 +210,19 @@ class ManyProcesses:
 
 
 def together() -> None:
-    """Wait until every process is here, with more patience than an exchange has."""
-    from jax._src import distributed  # nothing public waits for longer
+    """Barrier: wait up to `PATIENCE` until every process has arrived, which is longer than an exchange waits."""
+    from jax._src import distributed  # no public function has a longer timeout
 
     client: Any = distributed.global_state.client
     client.wait_at_barrier("consat", PATIENCE * 1000)
 
 
 class _Places(NamedTuple):
-    """Items of the whole team, and who has them.
+    """Distribution of a list of items (agents or rows) over the processes.
 
     Attributes:
-        mine: (W,) where this process finds its own, padded to the most that any has.
-        whose: for each process the numbers of its items.
+        mine: (W,) local indices of this process's items, padded with 0 to the largest number of any process.
+        whose: for each process the indices of its items in the list.
     """
 
     mine: np.ndarray
@@ -218,7 +230,15 @@ class _Places(NamedTuple):
 
     @classmethod
     def of(cls, items: np.ndarray, part: np.ndarray, held: np.ndarray, me: int, processes: int) -> _Places:
-        """From (K,) items, the process of each, what this process holds (−1: nothing of its own), and which process this is."""
+        """Distribute a list of items.
+
+        Args:
+            items: (K,) indices in the whole team.
+            part: process of each agent or row of the whole team.
+            held: indices in the whole team of what this process holds; −1 where it belongs to another process.
+            me: this process.
+            processes: number of processes.
+        """
         whose = [np.flatnonzero(part[items] == process) for process in range(processes)]
         width = max(map(len, whose), default=0)
         place = np.zeros(len(part), dtype=np.int64)
@@ -227,7 +247,7 @@ class _Places(NamedTuple):
         return cls(np.pad(mine, (0, width - len(mine))), whose)
 
     def all(self, gathered: np.ndarray) -> np.ndarray:
-        """(P, S, W, …) → (S, K, …) in the order of the items."""
+        """(P, S, W, …) gathered from all processes → (S, K, …) in the order of the list."""
         _, steps, _, *rest = gathered.shape
         found = np.empty((steps, sum(map(len, self.whose)), *rest))
         for mine, places in zip(gathered, self.whose, strict=True):
@@ -237,7 +257,7 @@ class _Places(NamedTuple):
 
 @functools.cache
 def _collectives(mesh: Mesh) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """The two exchanges: each to each, and each to all."""
+    """The two compiled exchanges: all-to-all and all-gather."""
     parts, whole = PartitionSpec("process"), PartitionSpec()
 
     def swap(mine: Array) -> Array:
@@ -253,6 +273,8 @@ def _collectives(mesh: Mesh) -> tuple[Callable[[Array], Array], Callable[[Array]
 
 
 class _Programs(NamedTuple):
+    """The compiled functions of `_compiled`."""
+
     begin: Callable[..., Now]
     empty: Callable[..., _Book]
     note: Callable[..., _Book]
@@ -264,7 +286,7 @@ class _Programs(NamedTuple):
 
 
 def _packed(spoken: Spoken) -> Array:
-    """(E, W) everything that crosses with a message."""
+    """(E, W) all arrays of a message, flattened and concatenated."""
     return jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(spoken.crossing)], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""The directory of a run: the record that grows, the checkpoint beside it, and the result file when it is done."""
+"""Files in the directory of a run: the record, the checkpoint, and the result file at the end."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from consat.results.trace import Trace
 
 LOG = "record.bin"
 SECONDS = 10.0
-"""Between two checkpoints when nobody says."""
+"""Default time between two checkpoints, s."""
 
 
 SWEEP = "sweep.json"
-"""What `consat.sweep` writes, beside its figure and table."""
+"""Summary file of `consat.sweep`, beside its figure and table."""
 
 
 def claim(directory: Path, scenario: str, *, force: bool) -> None:
-    """See, before anything is computed, that results can be written to a directory, and that those of another scenario are not overwritten.
+    """Check, before a run, that a directory is writable and holds no results of another scenario.
 
     Args:
-        directory: made if need be.
-        scenario: the name of the one whose results are to be written.
-        force: whether to overwrite whatever is there.
+        directory: directory of the results; created if missing.
+        scenario: name of the scenario whose results will be written.
+        force: whether to overwrite existing files of any origin.
 
     Raises:
-        InvalidSettings: it cannot be written to, or holds results of another scenario, or a file of that name that is none.
+        InvalidSettings: the directory is not writable, holds results of another scenario, or holds a foreign file with a name of a result.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -74,12 +74,12 @@ def _of_sweep(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Files:
-    """Where a run writes.
+    """Output files of a run.
 
     Attributes:
-        directory: made if need be.
-        seconds: between two checkpoints; None for none, or when a run is taken up for as many as before.
-        taken_up: the arrays and the rest of the checkpoint of the run that is taken up; None to begin anew.
+        directory: directory of the files; created if missing.
+        seconds: time between two checkpoints, s. None writes no checkpoints; a resumed run then keeps the interval of its checkpoint.
+        taken_up: arrays and metadata of the checkpoint to resume from; None for a new run.
     """
 
     directory: Path
@@ -88,11 +88,22 @@ class Files:
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """What the run that is taken up said of itself."""
+        """Metadata of the checkpoint to resume from; empty for a new run."""
         return {} if self.taken_up is None else self.taken_up[1]
 
     def sink(self, team: Team, copies: Estimates, choice: Choice, clock: str, *, heading: bool = False) -> Log:
-        """The record; `clock` is ``time`` or ``round``; heading: whether bodies have one."""
+        """Create the record.
+
+        Args:
+            team: the team.
+            copies: the layout of estimates.
+            choice: what is recorded.
+            clock: ``time`` or ``round``.
+            heading: whether bodies have a heading.
+
+        Raises:
+            InvalidResult: the record of the run to resume is missing.
+        """
         names = variables(self._labels(team, copies, choice), integral=clock == "time", bound=clock == "round", heading=heading)
         sizes = {"agent": len(choice.agents), "axis": team.dimension, "copy": 0 if choice.copies is None else len(choice.copies)}
         shapes = {name: tuple(sizes[along] for along in VARIABLES[name][0]) for name in names if clock == "time" or name != "velocity"}
@@ -108,14 +119,14 @@ class Files:
         return labels(team.ids, None if choice.everyone else choice.agents, copies.cluster, held)
 
     def checkpoints(self, about: Mapping[str, Any]) -> Checkpoint | None:
-        """Where the state is kept; `about` is what must be known to go on."""
+        """Create the checkpoint writer; None without checkpoints. `about`: metadata needed to resume the run."""
         seconds = self.about.get("seconds", SECONDS) if self.taken_up is not None and self.seconds is None else self.seconds
         if seconds is None:
             return None
         return Checkpoint(self.directory / checkpoint.NAME, seconds, {**about, "seconds": seconds}, self.taken_up)
 
     def finish(self, log: Log, trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> Trace:
-        """Write the result file, and take away the log if no checkpoint needs it."""
+        """Write the result file, and delete the record if no checkpoint needs it. Returns the trace with the path of the result."""
         path = self.directory / RESULT
         copies = None if trace.estimate is None else (trace.holder, trace.held)
         named = labels(team.ids, trace.recorded, trace.cluster, copies)

@@ -1,4 +1,4 @@
-"""Protocols in continuous time, integrated by diffrax."""
+"""Simulation of continuous-time protocols, integrated by diffrax."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from consat.protocols.estimates import Estimates, Exchange
 from consat.results.trace import Ending, Trace, satisfied_from
 
 HOLD = 10.0
-"""How long (s) every margin must stay positive before a flow counts as satisfied."""
+"""Time (s) for which every margin must stay positive before a flow counts as satisfied."""
 PATIENCE = 2000.0
-"""How long (s) a flow may take when nobody says."""
+"""Default limit of a flow's time, s."""
 SAMPLE = 0.1
 """Time between recorded samples, s."""
 CHUNK = 100
-"""Samples between two looks at the stop rule and the progress bar."""
+"""Number of samples between two checks of the stop rule and updates of the progress bar."""
 SETTLED = 1e-4
-"""A flow has settled when over `HOLD` no estimate moved by more than this fraction of the largest."""
+"""A flow has settled when over `HOLD` no coordinate moved by more than this fraction of the largest coordinate."""
 MOST_IMPLICIT = 150
-"""Up to this many numbers in the state an implicit solver is quicker, above an explicit one."""
+"""Largest number of floats in the state for which the implicit solver is used, because it is faster there; else an explicit one."""
 MOST_STEPS = 100_000
-"""Solver steps between two looks, after which a flow counts as too stiff."""
+"""Number of solver steps in one chunk after which a flow counts as too stiff."""
 SHORTEST = 1e-12
-"""The shortest step of a solver, s."""
+"""Smallest solver step, s."""
 ASTRAY = 1e6
-"""A flow whose states are so many times as large as the team and its start has diverged: it is stopped before they overflow."""
+"""A flow has diverged when an entry of its state exceeds this multiple of the size of the team and its start; it ends before overflow."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Problem:
-    """What a protocol runs on: every agent's own objective over its copies, and the links between copies.
+    """Data of a flow: every agent's objective over its copies, and the links between copies.
 
     Attributes:
-        objective: over the rows of the state.
-        exchange: the messages.
-        own: (C, 1) 1.0 where the holder's own position stands.
-        schedule: of ν.
-        limit: states beyond it, in any entry, have diverged.
+        objective: local objectives over the rows of the state.
+        exchange: edges between copies.
+        own: (C, 1) 1.0 on rows of own positions, else 0.0.
+        schedule: schedule of ν over time.
+        limit: () largest absolute value of an entry of the state before the flow counts as diverged.
     """
 
     objective: Objective
@@ -71,7 +71,7 @@ class Problem:
         return cls(objective, estimates.exchange(), on_device(own), schedule, on_device(limit))
 
     def astray(self, state: State) -> Array:
-        """Whether a state has diverged."""
+        """() whether a state has diverged."""
         return jnp.any(jnp.stack([jnp.any(~(jnp.abs(leaf) <= self.limit)) for leaf in jax.tree.leaves(state)]))
 
 
@@ -96,14 +96,14 @@ class Everyone:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Observer:
-    """Who looks at the whole team, and whom they write down.
+    """Observer of the whole team, which selects what is recorded.
 
     Attributes:
-        objective: over true positions.
+        objective: objective over the agents' positions.
         own: (N,) rows of own positions.
-        agents: (R,) who is recorded, or None for all in order.
-        copies: (E,) rows recorded, or None where estimates are not.
-        watched: (W,) constraints of which it is counted how often they are violated.
+        agents: (R,) recorded agents; None for all.
+        copies: (E,) recorded rows; None if estimates are not recorded.
+        watched: (W,) constraints whose violations are counted.
     """
 
     objective: Objective
@@ -119,7 +119,7 @@ class Observer:
         return cls(Objective.at_positions(team), on_device(estimates.own), agents, copies, on_device(choice.watched))
 
     def look(self, flow: Flow, problem: Problem, time: Array, state: State) -> Rows:
-        """The record of a time."""
+        """Record of one time, s."""
         position = state.x[self.own]
         margins = self.objective.agent_margins(position)
         smooth = self.objective.smooth_margin(position, problem.schedule.at(time))
@@ -133,22 +133,22 @@ class Observer:
 
 
 def rate(flow: Flow, problem: Problem, time: Array | float, state: State) -> State:
-    """d/dt of everybody's state: the protocol's per-agent function over all rows."""
+    """Time derivative of the state of all agents: the protocol's per-agent function over all rows."""
     local = Everyone(problem, problem.schedule.at(time))
     return flow.rate(state, local, problem.exchange.disagreement(flow.message(state)))
 
 
 class Advance(NamedTuple):
-    """An integration over some samples.
+    """Result of the integration over T samples.
 
     Attributes:
-        seen: the record of them; of those that were not reached, with no meaning.
-        wrong: (T, W) which watched constraints are violated there.
-        reached: (T,) which were.
-        state: at the end.
-        time: at the end, s.
-        astray: whether the state had diverged there.
-        moved: how far any position was, at a sample, from where it was at the start.
+        seen: record of the samples; meaningless for samples that were not reached.
+        wrong: (T, W) which watched constraints are violated at each sample.
+        reached: (T,) which samples were reached.
+        state: state at the end.
+        time: () time at the end, s.
+        astray: () whether the state at the end has diverged.
+        moved: () largest distance on any axis of a position, at a sample, from its value at the start.
     """
 
     seen: Rows
@@ -162,7 +162,7 @@ class Advance(NamedTuple):
 
 @functools.cache
 def _advance() -> Callable[..., Advance]:
-    """The compiled integration, from ``times[0]`` over the samples ``times[1:]``, or to where it must end."""
+    """The compiled integration from ``times[0]`` over the samples ``times[1:]``. It ends early where it diverges or is too stiff."""
     import diffrax
     import optimistix
 
@@ -206,7 +206,7 @@ _rate = jax.jit(rate, static_argnames=("flow",))
 
 
 def _largest(state: State) -> float:
-    """The largest entry; not finite if one is not."""
+    """Largest absolute value of an entry; not finite if an entry is not finite."""
     return float(max((np.abs(np.asarray(leaf)).max(initial=0.0) for leaf in jax.tree.leaves(state)), default=0.0))
 
 
@@ -232,21 +232,22 @@ def simulate_flow(
     infeasible: Callable[[np.ndarray], bool] = lambda _: False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Trace:
-    """Run a protocol in continuous time.
+    """Simulate a continuous-time protocol.
 
     Args:
-        team: whose clusters are connected.
+        team: team with connected clusters.
         flow: the protocol.
         estimates: the layout of copies.
-        schedule: of ν.
-        first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
-        until: when to end, s; `PATIENCE` if None.
-        stop: when to end earlier: every margin positive for `HOLD` (or `infeasible` and settled), settled, or never.
-        record: whether to keep estimates and integral states; if None, while they are few.
-        choice: what to record; if None, what the size of the team suggests.
-        sink: where to; in memory if None.
-        checkpoint: where to keep the state, and what to take up; nowhere and nothing if None.
-        infeasible: says of (N, d) positions whether they prove that no formation satisfies every constraint.
+        schedule: schedule of ν over time.
+        first: (C, d) initial estimates, with x_i^(i)(0) = x_i(0).
+        until: end time, s; `PATIENCE` if None.
+        stop: ``satisfied``: end when every margin was positive for `HOLD`, or when the flow has settled and `infeasible` holds.
+            ``converged``: end when the flow has settled. ``never``: run until `until`.
+        record: whether to record estimates and integral states; if None, only while they are few.
+        choice: what to record; if None, a choice that depends on the size of the team.
+        sink: where to record; in memory if None.
+        checkpoint: where to save the state, and the checkpoint to resume from; None for neither.
+        infeasible: tells whether positions, (N, d), prove that no formation satisfies every constraint.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     choice = choice or Choice.of(team, estimates, estimates=record)
@@ -262,13 +263,13 @@ def simulate_flow(
 
 @dataclass
 class _Tally(Steps):
-    """What is counted of a flow.
+    """Counters of a flow.
 
     Attributes:
-        time: of the last sample, s.
-        satisfied_from: the time after the last at which the margin was ≤ 0, interpolated; None if the last margin is.
-        good: for how many samples on end the margin has been positive.
-        violated: (W,) at how many samples each watched constraint was violated.
+        time: time of the last sample, s.
+        satisfied_from: time, s, from which on the margin has been positive, interpolated between samples; None if it is not now.
+        good: number of consecutive samples, up to now, with a positive margin.
+        violated: (W,) number of samples at which each watched constraint was violated.
     """
 
     time: float = 0.0
@@ -277,7 +278,13 @@ class _Tally(Steps):
     violated: Any = 0
 
     def add(self, rows: Rows, violated: Any, moved: float = np.inf) -> None:
-        """Count some samples, K of them, at which each watched constraint is `violated`, (K, W), or not."""
+        """Count K samples.
+
+        Args:
+            rows: their record.
+            violated: (K, W) whether each watched constraint was violated.
+            moved: largest distance of a position from its value at the start of the chunk.
+        """
         count, first = len(rows.step), self.done < 0
         at, margin = (rows.step, rows.margin) if first else (np.append(self.time, rows.step), np.append(self.margin, rows.margin))
         bad = np.flatnonzero(~(rows.margin > 0))
@@ -291,7 +298,7 @@ class _Tally(Steps):
 
 @dataclass
 class _Course:
-    """A flow, for `consat.engine.loop`; `grid` are the times of all samples, the rest is as in `simulate_flow`."""
+    """`consat.engine.loop.Course` of a flow. `grid`: times of all samples, s; the other fields are as in `simulate_flow`."""
 
     team: Team
     flow: Flow
@@ -327,16 +334,16 @@ class _Course:
         return self._early(state, ahead, rows, every)
 
     def _violated(self, state: State) -> Array:
-        """(1, W) which watched constraints are violated."""
+        """(1, W) which watched constraints are violated in a state."""
         return violated(self.observer.objective, self.observer.watched, state.x[self.observer.own])[None]
 
     def _overflows(self, state: State) -> bool:
-        """Whether even the shortest step would lead astray."""
+        """Whether even the smallest solver step would make the state diverge."""
         largest = _largest(_rate(self.flow, self.problem, on_device(self.grid[0]), state))
         return not largest * SHORTEST <= float(self.problem.limit)
 
     def _early(self, before: State, ahead: Advance, rows: Rows, every: int) -> tuple[State, Rows, Ending]:
-        """The end of a flow that did not get to the next sample: at its last state that is finite."""
+        """End a flow that did not reach the last sample of the chunk, at its last finite state."""
         done, state = self.tally.done, ahead.state if np.isfinite(_largest(ahead.state)) else before
         if len(rows.step):
             self.tally.add(rows, np.asarray(ahead.wrong)[: len(rows.step)])
@@ -350,7 +357,7 @@ class _Course:
         return state, kept, ending
 
     def _ending(self, state: State) -> Ending | None:
-        """Why the run should end now, or None."""
+        """Reason to end the run now; None to go on."""
         tally = self.tally
         if self.stop == "satisfied" and tally.good > HOLD / SAMPLE:
             return "satisfied"

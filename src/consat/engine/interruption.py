@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a run between two chunks, when its state is whole; a second Ctrl-C ends it at once."""
+"""Signal handling: Ctrl-C and SIGTERM end a run between two chunks, when its state is consistent; a second Ctrl-C ends it at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Any
 
 @contextmanager
 def heeded() -> Iterator[Callable[[], bool]]:
-    """Gives a function that tells whether a signal to stop has come. Only the main thread can hear signals; elsewhere it never does."""
+    """Handle SIGINT and SIGTERM inside the context. Yields a function that tells whether a signal has arrived. Signals reach the main
+    thread only; in other threads the function always returns False."""
     asked = False
 
     def hear(number: int, frame: Any) -> None:

@@ -1,6 +1,6 @@
-"""Parameters that change while rounds go on, because they follow a schedule or because a session changes them.
+"""Constraint parameters that change during a run, because they follow a schedule or because a session sets them.
 
-They are arguments of the compiled program, never constants in it: a changed parameter compiles nothing.
+They are arguments of the compiled program, not constants in it, so that a change does not cause a compilation.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from consat.problem.schedule import Track
 from consat.problem.team import Team
 
 Values = tuple[Mapping[str, Array], ...]
-"""Of each family the parameters that may change, (M_f, …), by their names."""
+"""For each family its changeable parameters, name to (M_f, …)."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Live:
-    """What may change of a team's constraints.
+    """Changeable parameters of a team's constraints.
 
     Attributes:
-        parameters: at time 0, or as they were last set.
-        tracks: how they move, of each family.
-        period: of a round, s.
+        parameters: values at time 0, or as last set.
+        tracks: for each family the schedules of its moving parameters.
+        period: () duration of a round, s.
     """
 
     parameters: Values
@@ -38,12 +38,12 @@ class Live:
 
     @classmethod
     def of(cls, team: Team, period: float, *, all_of_them: bool) -> Live | None:
-        """Of a team.
+        """The changeable parameters of a team; None without any.
 
         Args:
             team: the team.
-            period: of a round, s.
-            all_of_them: whether any parameter may be set, not only what moves; None where there is then nothing.
+            period: duration of a round, s.
+            all_of_them: whether every parameter may be set; else only those that move.
         """
         if not (all_of_them or team.moves):
             return None
@@ -55,7 +55,7 @@ class Live:
         return cls(tuple(kept), tracks, jnp.asarray(float(period)))
 
     def at(self, round_: Array) -> Values:
-        """The parameters at the end of the rounds of this number."""
+        """The parameters at time `round_` · `period`. `round_`: () number of finished rounds."""
         time = round_ * self.period
         return tuple(
             {key: array if (track := tracks.get(key)) is None else _moved(jnp.asarray(array), track, time) for key, array in own.items()}
@@ -64,7 +64,7 @@ class Live:
 
 
 def _moved(array: Array, track: Track, time: Array) -> Array:
-    """The parameter, (M_f, …), with the values of those that move at a time."""
+    """The parameter, (M_f, …), with the rows that move set to their values at `time`, s (piecewise linear)."""
     times, values = track.times, track.values
     last = times.shape[1] - 1
     k = jnp.maximum(jnp.sum((times <= time).astype(jnp.int32), axis=1) - 1, 0)

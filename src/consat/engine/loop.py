@@ -1,4 +1,4 @@
-"""The loop around a run, in rounds or in continuous time: what is recorded of it, what is kept to go on from, and when it ends."""
+"""Main loop of a run, in rounds or in continuous time: advances the state by chunks, records, saves checkpoints and stops."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from consat.results.trace import Ending, Trace
 
 @dataclass
 class Steps:
-    """What is counted as a run goes on; numbers, and arrays of them, which a checkpoint holds.
+    """Counters of a run. All fields are scalars or arrays, so that a checkpoint can store them.
 
     Attributes:
-        done: steps after the first: rounds, or samples of a flow.
-        margin: the last.
-        drift: how far any position moved over the last chunk.
-        recorded: steps in the record.
-        every: each how manieth step is recorded.
+        done: number of the last step; a step is a round or a sample of a flow, and the start is step 0.
+        margin: the last margin of the team.
+        drift: largest distance that a position moved over the last chunk.
+        recorded: number of steps in the record.
+        every: record one step in `every`.
     """
 
     done: int = -1
@@ -36,35 +36,43 @@ class Steps:
 
 
 class Course(Protocol):
-    """What is run, a chunk of steps at a time."""
+    """A simulation that advances by chunks of steps."""
 
     tally: Any
-    """Its `Steps`, and what else it counts."""
+    """Counters: `Steps` or a subclass."""
     end: int
-    """Steps at most."""
+    """Largest number of steps."""
 
     def start(self) -> tuple[Any, Rows]:
-        """The state before the first step, and the record of it."""
+        """The initial state and its record."""
         ...
 
     def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
-        """A chunk of steps from a state, which is given up; the record of every so manieth, and why the run should end."""
+        """Advance `state` by one chunk. The input buffers are donated and must not be used again.
+
+        Args:
+            state: the state.
+            every: record one step in `every`.
+
+        Returns:
+            The new state, the record, and the reason to end the run; None to go on.
+        """
         ...
 
     def agree(self, stop: bool) -> bool:
-        """Whether anybody wants to stop."""
+        """Whether any of the processes wants to stop. `stop`: whether this one does."""
         ...
 
     def look(self, state: Any) -> Rows:
-        """The record of the state as it is."""
+        """Record of the present state."""
         ...
 
     def positions(self, state: Any) -> np.ndarray:
-        """(N, d) everyone's positions."""
+        """(N, d) positions of all agents."""
         ...
 
     def told(self, rows: Rows) -> Mapping[str, Any]:
-        """Fields of the `Trace` that rounds and flows find differently."""
+        """Fields of the `Trace` that differ between rounds and flows. `rows`: the record of the run."""
         ...
 
 
@@ -72,15 +80,15 @@ def follow(
     course: Course, copies: Estimates, choice: Choice, *, sink: Sink, checkpoint: Checkpoint | None, problem: str,
     progress: Callable[[float, float], None],
 ) -> Trace:  # fmt: skip
-    """Run to the end.
+    """Run a simulation to its end.
 
     Args:
-        course: what is run.
+        course: the simulation.
         copies: the layout of estimates.
         choice: what is recorded.
-        sink: where to.
-        checkpoint: where the state is kept, and what to take up; nowhere and nothing if None.
-        problem: its fingerprint.
+        sink: where to record.
+        checkpoint: where to save the state, and the checkpoint to resume from; None for neither.
+        problem: fingerprint of the problem; see `consat.engine.checkpoint.fingerprint`.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     ending: Ending = "out of time"
@@ -141,7 +149,7 @@ def follow(
 
 
 def _heard(progress: Callable[[float, float], None], done: float, margin: float) -> bool:
-    """Whether whoever watches lets the run go on."""
+    """Report the progress. False if `progress` raises KeyboardInterrupt, which ends the run."""
     try:
         progress(done, margin)
     except KeyboardInterrupt:

@@ -1,7 +1,7 @@
-"""Who computes which agents, where several processes share a team: few links cut, and what crosses them.
+"""Partition of a team among several processes, with few links between processes, and the data that crosses these links.
 
-A process holds its own agents, then those of other processes that it hears from or whose positions its constraints are judged by. The
-latter's messages are computed where they live, and put in place of what would stand at their ends here before anybody hears.
+A process holds its own agents first. Behind them come the agents of other processes that send messages to its agents, or whose positions
+its constraints read. Messages of such agents are computed in their own process, and replace the local entries before any agent receives.
 """
 
 from __future__ import annotations
@@ -19,32 +19,33 @@ from consat.protocols.estimates import Estimates
 
 
 def assign(team: Team, copies: Estimates, processes: int) -> np.ndarray:
-    """(N,) the process of each agent: equal shares, in an order in which linked agents stand close together (reverse Cuthill–McKee).
+    """(N,) the process of each agent: shares of about equal work, cut from an order in which linked agents are close together (reverse
+    Cuthill–McKee).
 
     Args:
         team: the team.
         copies: its layout of estimates.
-        processes: how many.
+        processes: number of processes.
     """
     links, count = copies.links, team.count
     both = np.concatenate([links, links[:, ::-1]])
     graph = coo_array((np.ones(len(both), dtype=np.int8), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
     order = reverse_cuthill_mckee(graph, symmetric_mode=True)
-    work = np.cumsum(1.0 + np.bincount(copies.holder, minlength=count)[order])  # an agent's copies are what costs
+    work = np.cumsum(1.0 + np.bincount(copies.holder, minlength=count)[order])  # the cost of an agent is proportional to its copies
     part = np.empty(count, dtype=np.int32)
     part[order] = np.minimum((work - 1e-9) * processes / work[-1], processes - 1).astype(np.int32)
-    if len(np.unique(part)) < processes:  # few agents, of which some have much to do
+    if len(np.unique(part)) < processes:  # few agents with very unequal work left a process without agents
         part[order] = np.arange(count) * processes // count
     return part
 
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """What one process exchanges with each of the others, in arrays padded to the largest exchange of any two.
+    """Items that one process exchanges with each of P processes, padded to the largest exchange H of any two.
 
     Attributes:
-        out: (P, H) what goes to each process, padded with any.
-        into: (P, H) where what comes from each process is put, padded with a place past the end.
+        out: (P, H) local indices of the items sent to each process, padded with 0.
+        into: (P, H) local indices where the items received from each process are stored, padded with an index past the end.
     """
 
     out: np.ndarray
@@ -53,16 +54,16 @@ class Halo:
     @classmethod
     def of(cls, place: np.ndarray, source: np.ndarray, target: np.ndarray, key: np.ndarray, me: int, processes: int, *,
            end: int) -> Halo:  # fmt: skip
-        """From a list of what goes from whom to whom, in the same order everywhere.
+        """From a list of K items, which is the same in every process.
 
         Args:
-            place: (K,) where it stands in this process, if it is its source or its target.
-            source: (K,) process.
-            target: (K,) process, another.
-            key: (K,) what the items of a pair of processes are sorted by.
+            place: (K,) local index of each item; arbitrary where this process is neither source nor target.
+            source: (K,) sending process.
+            target: (K,) receiving process, different from the source.
+            key: (K,) sort key of the items of a pair of processes.
             me: this process.
             processes: P.
-            end: a place past the end.
+            end: an index past the end.
         """
         width = int(np.bincount(source * processes + target, minlength=1).max(initial=0))
         out, into = np.zeros((processes, width), dtype=np.int32), np.full((processes, width), end, dtype=np.int32)
@@ -76,20 +77,20 @@ class Halo:
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """What one process holds of a team.
+    """The part of a team that one process holds: n agents, c copies, e ends of links.
 
     Attributes:
-        team: its agents with their constraints, and the others it needs without any.
-        copies: the layout of their estimates, in which these agents are numbered anew.
-        agents: (n,) their numbers in the whole team; this process's come first.
-        mine: how many are this process's.
-        rows: (c,) of its copies, where they stand in the whole layout.
+        team: this process's agents with their constraints, and the other needed agents without constraints.
+        copies: layout of their estimates; agents have local indices.
+        agents: (n,) indices in the whole team; this process's agents come first.
+        mine: number of this process's agents.
+        rows: (c,) rows of the local copies in the layout of the whole team.
         ours: (c,) whether a copy is held by an agent of this process.
-        degree: (e,) of each end the larger number of links of its own and the other's copy, in the whole team.
-        messages: what stands at ends of links that other processes need.
-        positions: of agents that other processes need.
-        pair: numbers in the whole team of the pairs that speak here, in the order in which the kernel counts them.
-        pairs: how many there are in the whole team.
+        degree: (e,) for each end the larger number of links of the copies at both ends, in the whole team.
+        messages: exchange of messages at ends of links.
+        positions: exchange of positions that constraints of other processes read.
+        pair: indices in the whole team of the local (sender, receiver) pairs, sorted as in the local layout.
+        pairs: number of such pairs in the whole team.
     """
 
     team: Team
@@ -106,7 +107,15 @@ class Share:
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, part: np.ndarray, me: int, processes: int) -> Share:
-        """The share of process `me`; every process works it out for itself from the whole team."""
+        """Compute the share of process `me`. Every process computes its own share from the whole team.
+
+        Args:
+            team: the whole team.
+            copies: its layout of estimates.
+            part: (N,) the process of each agent.
+            me: this process.
+            processes: number of processes.
+        """
         count, holder, position = team.count, copies.holder, copies.position
         receiver, sender = copies.edges.astype(np.int64).T
         from_, to = part[holder[sender]], part[holder[receiver]]
@@ -136,7 +145,7 @@ class Share:
         )  # fmt: skip
 
         cut = np.flatnonzero(from_ != to)
-        # the message at an end goes to where the link's other end is
+        # the message at an end is sent to the process of the other end
         messages = Halo.of(end[cut], to[cut], from_[cut], receiver[cut] * copies.count + sender[cut], me, processes, end=len(here))
         across = part[owner] != part[read]
         wanted = np.unique(part[owner[across]].astype(np.int64) * count + read[across])
@@ -155,7 +164,7 @@ class Share:
 
 
 def _members(team: Team, local: np.ndarray, part: np.ndarray, me: int, count: int) -> Team:
-    """The agents of a process, numbered anew, with their constraints."""
+    """The local agents with the constraints of process `me`. `local`: (N,) local index of each agent; `count`: number of local agents."""
     families, owners = [], []
     for family in team.families:
         chosen = np.flatnonzero(part[family.owner] == me)
@@ -164,7 +173,7 @@ def _members(team: Team, local: np.ndarray, part: np.ndarray, me: int, count: in
             owners.append(local[family.owner[chosen]])
     owner = np.concatenate([np.zeros(0, dtype=np.int64), *owners])
     rank = np.empty(len(owner), dtype=np.int64)
-    # in the order in which the whole team has them
+    # keep the order of the whole team
     numbers = np.concatenate([np.zeros(0, dtype=np.int64), *(family.number[chosen] for family, chosen in families)])
     rank[np.lexsort((numbers, owner))] = np.arange(len(owner))
     made, start = [], 0

@@ -1,4 +1,4 @@
-"""What is kept of a run: of whom, how often, and where: in memory, or in a result file that grows as the run goes on."""
+"""Recording of a run: which agents, how often, and where (in memory, or in a file that grows during the run)."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 
 MOST_AGENTS = 10_000
-"""Of larger teams a sample is recorded when nobody says of whom, …"""
+"""Largest team of which all agents are recorded by default."""
 SAMPLE = 1000
-"""… of so many agents."""
+"""Number of agents that are recorded by default of a larger team."""
 MOST_ESTIMATES = 1000
-"""Estimates are recorded by default while there are at most this many numbers."""
+"""Largest number of floats for which estimates are recorded by default."""
 MOST_KEPT = 20_000_000
-"""A record in memory that outgrows this many numbers loses every second step, again and again."""
+"""Largest number of floats of a record in memory. When it is exceeded, every second step is dropped."""
 
 BLOCK = 2**25
-"""Bytes that are read of a `Log` at a time, about."""
+"""Approximate number of bytes of a `Log` that are read at a time."""
 
 Who = Sequence[str] | Literal["all", "none"] | None
-"""Of whom positions and margins are recorded: ids, all, nobody, or, if None, all of a team that is not large."""
+"""Agents whose positions and margins are recorded: a list of ids, all, none; None for the default, which depends on the team's size."""
 
 
 class Rows(NamedTuple):
-    """The record of K steps; K is the leading axis.
+    """Record of K steps, of R agents and E copies.
 
     Attributes:
-        step: (K,) times or rounds.
-        position: (K, R, d).
-        velocity: (K, R, d), or None where it is the difference between steps.
-        margin: (K,).
-        smooth_margin: (K,).
-        agent_margin: (K, R).
-        estimate: (K, E, d), or None.
-        integral: (K, E, d), or None.
-        bound: (K,) on the best margin, proven by all agents, NaN where none is; None in continuous time.
-        heading: (K, R) rad; None where bodies have none.
+        step: (K,) times in s, or numbers of rounds.
+        position: (K, R, d) positions.
+        velocity: (K, R, d) velocities; None where they are differences between steps.
+        margin: (K,) margin of the team.
+        smooth_margin: (K,) smooth margin of the team.
+        agent_margin: (K, R) margin of each agent.
+        estimate: (K, E, d) estimates; None if not recorded.
+        integral: (K, E, d) integral states; None if not recorded.
+        bound: (K,) upper bound on the best margin that all agents have proven, NaN without one; None in continuous time.
+        heading: (K, R) headings, rad; None for bodies without a heading.
     """
 
     step: Any
@@ -60,11 +60,11 @@ class Rows(NamedTuple):
     heading: Any = None
 
     def where(self, chosen: np.ndarray) -> Rows:
-        """Some of the steps."""
+        """The chosen steps; `chosen` is a mask or an array of indices."""
         return Rows(*(None if leaf is None else leaf[chosen] for leaf in self))
 
     def joined(self, more: Rows) -> Rows:
-        """These steps, and more."""
+        """These steps followed by the steps of `more`."""
         return Rows(*(None if leaf is None else np.concatenate([leaf, other]) for leaf, other in zip(self, more, strict=True)))
 
 
@@ -73,11 +73,11 @@ class Choice:
     """What is recorded.
 
     Attributes:
-        agents: (R,) whose positions and margins, in order.
-        copies: (E,) which rows of the state, or None.
-        every: each how manieth step; the first and the last are kept in any case.
-        everyone: whether that is the whole team.
-        watched: (W,) constraints of which it is counted how often they are violated.
+        agents: (R,) agents whose positions and margins are recorded, in increasing order.
+        copies: (E,) recorded rows of the state; None if estimates are not recorded.
+        every: record one step in `every`; the first and the last step are always recorded.
+        everyone: whether `agents` is the whole team.
+        watched: (W,) constraints whose violations are counted.
     """
 
     agents: np.ndarray
@@ -88,18 +88,18 @@ class Choice:
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, who: Who = None, estimates: bool | None = None, every: int = 1) -> Choice:
-        """What is asked for, or what the size of the team suggests.
+        """Resolve the request, with defaults that depend on the size of the team.
 
         Args:
             team: the team.
             copies: the layout of estimates.
             who: see `Who`.
-            estimates: whether to keep all estimates (and integral states) that recorded agents hold of recorded agents; if None, while
-                they are few.
-            every: each how manieth step.
+            estimates: whether to record all estimates (and integral states) that recorded agents hold of recorded agents; if None, only
+                while they are few.
+            every: record one step in `every`.
 
         Raises:
-            InvalidSettings: no such agent, or no such step.
+            InvalidSettings: unknown agent, or `every` below 1.
         """
         if every < 1:
             raise InvalidSettings(f"every is {every}, but must be a whole number from 1: each how manieth step to record")
@@ -129,31 +129,31 @@ def _agents(team: Team, who: Who) -> np.ndarray:
 
 
 class Sink(Protocol):
-    """Where the record goes."""
+    """Destination of the record."""
 
     every: int
-    """Each how manieth step is wanted."""
+    """Record one step in `every`."""
 
     @property
     def path(self) -> Path | None:
-        """The file, if it is one."""
+        """The file; None for a record in memory."""
         ...
 
     def append(self, rows: Rows) -> None:
-        """Add the record of further steps, all of them multiples of `every`, or the last of the run."""
+        """Append steps. Their numbers are multiples of `every`, except for the last step of the run."""
         ...
 
     def flush(self) -> None:
-        """See that what was added survives the process, if it can."""
+        """Write the appended steps to disk, so that they survive the process; does nothing for a record in memory."""
         ...
 
     def close(self) -> Rows:
-        """End the record, and give back what of it is in memory: at least its last step."""
+        """Close the record. Returns the part that is in memory: at least the last step."""
         ...
 
 
 class Memory:
-    """A record in memory, thinned where it would grow too large."""
+    """Record in memory. It drops every second step whenever it exceeds `MOST_KEPT` floats."""
 
     path: Path | None = None
 
@@ -163,7 +163,7 @@ class Memory:
         self._kept = 0
 
     def append(self, rows: Rows) -> None:
-        """Add the record of further steps."""
+        """Append steps; thins the record if it is too large, and then doubles `every`."""
         self._rows.append(rows)
         self._kept += sum(leaf.size for leaf in rows if leaf is not None)
         if self._kept > MOST_KEPT and sum(len(part.step) for part in self._rows) > 2:
@@ -173,27 +173,27 @@ class Memory:
             self.every *= 2
 
     def flush(self) -> None:
-        """Nothing in memory survives."""
+        """Does nothing: a record in memory is lost with the process."""
 
     def _whole(self) -> Rows:
         return Rows(*(None if parts[0] is None else np.concatenate(parts) for parts in zip(*self._rows, strict=True)))
 
     def close(self) -> Rows:
-        """Everything that was kept."""
+        """All recorded steps."""
         return self._whole()
 
 
 class Log:
-    """A record in a file, so that what is in memory stays small, however long the run; `steps` reads it back.
+    """Record in a file, so that memory use does not grow with the run; `steps` reads it back.
 
-    Plain float64 numbers, a row a step, added at the end and nowhere else: whatever ends the process, the rows that were written stay, and
-    a run that is taken up cuts off those that came after its checkpoint.
+    The file holds float64 numbers, one row per step, and is only appended to. The written rows stay valid however the process ends. A
+    resumed run cuts off the rows after its checkpoint.
 
     Args:
-        path: of the file.
-        shapes: of the variables, a step; ``step`` first.
-        every: each how manieth step.
-        count: go on after so many steps; None for a new file.
+        path: path of the file.
+        shapes: shape of each variable in one step; ``step`` first.
+        every: record one step in `every`.
+        count: number of steps to keep of an existing file; None for a new file.
     """
 
     def __init__(self, path: Path, shapes: Mapping[str, tuple[int, ...]], every: int = 1, count: int | None = None) -> None:
@@ -206,7 +206,7 @@ class Log:
         self._file: BinaryIO | None = None
 
     def append(self, rows: Rows) -> None:
-        """Write further steps."""
+        """Append steps to the file."""
         if not len(rows.step):
             return
         flat = [np.asarray(getattr(rows, name), dtype=float).reshape(len(rows.step), -1) for name in self._shapes]
@@ -214,17 +214,17 @@ class Log:
         self._last = rows.where(np.array([-1]))
 
     def flush(self) -> None:
-        """See that what was added survives the process."""
+        """Write all appended steps to disk (fsync)."""
         self._opened().flush()
         os.fsync(self._opened().fileno())
 
     def close(self) -> Rows:
-        """The last step."""
+        """Close the file. Returns the last step."""
         self._opened().close()
         return Rows(**{**dict.fromkeys(Rows._fields), **_shaped(self._read(-1), self._shapes)}) if self._last is None else self._last
 
     def _opened(self) -> BinaryIO:
-        """The file, opened when it is first written to: by then whatever is taken up is known to fit."""
+        """The file, opened at the first write: a checkpoint to resume from has been checked by then."""
         if self._file is None:
             self._log.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._log.open("wb" if self._begin is None else "r+b")
@@ -238,21 +238,21 @@ class Log:
 
     @property
     def count(self) -> int:
-        """How many steps the file holds."""
+        """Number of steps in the file."""
         return self._log.stat().st_size // self._row
 
     def steps(self, period: float) -> Iterator[dict[str, np.ndarray]]:
-        """What was recorded, some steps at a time, with the velocities where they are differences between steps.
+        """Read the record, block by block. Velocities that were not recorded are computed as differences between steps.
 
         Args:
-            period: of a step, s, for these.
+            period: duration of a step, s.
         """
         count, most = self.count, max(1, BLOCK // self._row)
         with self._log.open("rb") as file:
             for start in range(0, count, most):
                 more = min(most, count - start)
                 file.seek(start * self._row)
-                block = np.frombuffer(file.read((more + 1) * self._row)).reshape(-1, self._row // 8)  # one step of the next block
+                block = np.frombuffer(file.read((more + 1) * self._row)).reshape(-1, self._row // 8)  # + 1 step for the velocity
                 rows = _shaped(block, self._shapes)
                 if "position" in rows and "velocity" not in rows:
                     rows["velocity"] = velocities(rows["step"], rows["position"], period)
@@ -266,12 +266,12 @@ def _shaped(block: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> dict[st
 
 
 def velocities(step: np.ndarray, position: np.ndarray, period: float) -> np.ndarray:
-    """(K, R, d) between each step and the next, 0 at the last.
+    """(K, R, d) mean velocities between each step and the next; 0 at the last step.
 
     Args:
         step: (K,) numbers of the steps.
-        position: (K, R, d).
-        period: of a step, s.
+        position: (K, R, d) positions.
+        period: duration of a step, s.
     """
     gap = np.diff(step, append=step[-1:] + 1) * period
     return np.asarray(np.diff(position, axis=0, append=position[-1:]) / gap[:, None, None])

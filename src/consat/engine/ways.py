@@ -1,4 +1,5 @@
-"""Ways round obstacles, planned on the host between chunks of rounds, by whose target has moved who lost sight of its way, or waits."""
+"""Path planning around obstacles, on the host between chunks of rounds. A robot gets a new path when its target has moved, when it no
+longer sees its next waypoint, or when it has waited too long."""
 
 from __future__ import annotations
 
@@ -10,24 +11,24 @@ from consat.robots import Drive, Planner, disc
 from consat.robots.obstacles import map_of
 
 MOVED = 0.5
-"""Of a robot's size: a target that moved by so much wants another way."""
+"""Distance by which a target must move for a new path, in multiples of the robot's size."""
 
 
 WAITED = 1.0
-"""Who came no nearer for so long, s, looks whether it still sees where it goes: others may have pushed it behind a corner."""
+"""Time without progress, s, after which a robot checks that it still sees its next waypoint: others may have pushed it behind a corner."""
 
 DETOUR = 3.0
-"""Who came no nearer for so long, s, and each time as long again, looks for a way round those who stand near it, in the plane."""
+"""Time without progress, s, after which a robot in the plane looks for a path around standing robots near it; repeated at this interval."""
 STANDS = 3.0
-"""A robot stands that is nearer to its target than so many times its tolerance: others may be pushing it."""
+"""A robot counts as standing if its distance to its target is below this multiple of its tolerance; other robots may be pushing it."""
 
 
 class Ways:
-    """Plans for the robots of a team; each by itself, from the public map.
+    """Path planner for the robots of a team. Each robot plans alone, on the public map.
 
     Args:
         drive: the robots.
-        every: how many rounds pass between two plans, at most.
+        every: largest number of rounds between two calls of `planned`.
     """
 
     def __init__(self, drive: Drive, every: int) -> None:
@@ -37,8 +38,14 @@ class Ways:
         self._planner = Planner(drive.map, float(np.max(drive.size)))
 
     def planned(self, robots: Driven, place: np.ndarray, targets: np.ndarray) -> Driven:
-        """With new ways, from (N, d) places to (N, d) targets, for robots whose targets are no longer where their ways end, and for those
-        who wait without seeing the next waypoint."""
+        """The robots with new paths where needed: where the target is no longer at the end of the path, where a waiting robot does not see
+        its next waypoint, and where a waiting robot can detour around standing ones.
+
+        Args:
+            robots: the robots.
+            place: (N, d) positions.
+            targets: (N, d) targets.
+        """
         assert robots.paths is not None
         paths = np.array(robots.paths)
         moved = np.linalg.norm(paths[:, -1] - targets, axis=1) > self._tolerance
@@ -65,7 +72,7 @@ class Ways:
         return robots._replace(memory=memory, paths=on_device(paths))
 
     def _detour(self, i: int, place: np.ndarray, targets: np.ndarray) -> np.ndarray | None:
-        """A way of robot i past the map and those whom it sees stand; None where nobody does, or no way leads past them."""
+        """Path of robot i around the obstacles of the map and the standing robots in range; None without standing robots or such a path."""
         drive = self._drive
         stands = np.linalg.norm(targets - place, axis=1) < STANDS * np.asarray(drive.arrives)
         stands &= np.linalg.norm(place - place[i], axis=1) < drive.range

@@ -1,4 +1,4 @@
-"""The protocols, one a file with its equation first. To add one, write such a file and list it here."""
+"""Registry of the protocols. Each protocol has a module that begins with its equations; add a new one to `FLOWS` or `ROUNDS`."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -15,19 +15,19 @@ from consat.protocols.selfish import Selfish
 from consat.settings import ProtocolSettings
 
 FLOWS: Final[Mapping[str, Callable[[], Flow]]] = {flow.name: flow for flow in (GradientFlow, ProportionalIntegral, Selfish)}
-"""What ``--protocol`` may say of continuous time."""
+"""Continuous-time protocols, by their name in ``--protocol``."""
 
 ROUNDS: Final[Mapping[str, Callable[[], Rounds]]] = {
     "interior-point": InteriorPoint, "max-min": max_min, "admm": Admm, "proximal": Proximal,
 }  # fmt: skip
-"""What ``--protocol`` may say of rounds."""
+"""Discrete-time protocols (rounds), by their name in ``--protocol``."""
 
 PAIRED: Final = tuple(name for name, protocol in ROUNDS.items() if protocol().speaks == "pair")
-"""Protocols that speak to each neighbour as a whole, not copy by copy."""
+"""Protocols that send one message per pair of neighbours instead of one per shared copy."""
 
 
 def with_gains(protocol: Any, asked: ProtocolSettings) -> Any:
-    """The protocol with the gains that the scenario asks for. Raises: InvalidSettings: it has no such gain."""
+    """Replace the gains of `protocol` by those that the scenario sets. Raises: InvalidSettings: the protocol has no such gain."""
     gains = {key: value for key, value in asked.model_dump().items() if key not in ("kind", "estimates") and value is not None}
     if unknown := gains.keys() - {field.name for field in dataclasses.fields(protocol)}:
         raise InvalidSettings(f"protocol {asked.kind} has no gain {', '.join(sorted(unknown))}; leave it out")

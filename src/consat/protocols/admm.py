@@ -1,20 +1,23 @@
 """Relaxed ADMM over local estimates (Bastianello, Carli, Schenato, Todescato, arXiv 1901.09252). For each link and shared copy agent i
-keeps a point u_ij (w_ij = ρ_ij u_ij in the paper), and in each round
+keeps a point u_ij (w_ij = ρ_ij u_ij in the paper). Each round is
 
     x_i⁺ = argmin_y f_i(y) + Σ_j ρ_ij/2 ‖y − u_ij‖²
     send   x_i⁺ and the force  g_ij = ρ_ij (u_ij − x_i⁺)
-    on receipt from j:   u_ij ← (1 − a) u_ij + a (x_j − g_ji/ρ_ij)             a lost message leaves u_ij as it was
+    on receipt from j:   u_ij ← (1 − a) u_ij + a (x_j − g_ji/ρ_ij)             a lost message leaves u_ij unchanged
 
-x_j − g_ji/ρ_ij is q_ji/ρ_ij of the paper where both ends hold the same penalty, and keeps the balance of forces while they don't, because
-a message that told of a change was lost: points alone would drift apart. It converges under random loss and wake-ups from any u: there is
-no invariant to lose. The penalty of a link is the geometric mean of what its two ends want, ρ_ij = √(ρ_i ρ_j), which they send along. It
-begins stiff, where constraints are met soonest; then each end lets ρ_i rise slowly towards the stiffness of its own f_i, faster while its
-own constraints are violated, and fall so only once it knows that all are satisfied: by then the optimum is all that is left to find, and a
-soft penalty finds it soonest. A copy that no constraint of its holder reads follows its neighbours. When ρ_ij changes, u_ij − x_i is
-rescaled with it, so that the force ρ_ij (u_ij − x_i) stays. Where some ψ are not concave no ρ falls: below the negative curvature of f_i
-the step would have no minimum.
+Messages. Where both ends hold the same penalty, x_j − g_ji/ρ_ij equals q_ji/ρ_ij of the paper. The two penalties differ while a message
+about a change is lost. Sending the force keeps the forces in balance even then; sending points alone would let them drift apart. The
+protocol converges under random message loss and random wake-ups from any u, because it depends on no invariant of the initial state.
 
-The points begin where the team's places are, however far out the bodies start: any would do, and near ones are rounds away.
+Penalty. ρ_ij = √(ρ_i ρ_j) is the geometric mean of the penalties that its two ends want, which they send along. It starts stiff, because
+a stiff penalty satisfies the constraints soonest. Each end then lets ρ_i rise slowly towards the stiffness of its own f_i, and faster while
+its own constraints are violated. ρ_i may fall towards that stiffness only once the agent knows that all constraints are satisfied: only the
+optimum is left to find then, and a soft penalty finds it soonest. A copy that no constraint of its holder reads takes the mean penalty of
+its neighbours. When ρ_ij changes, u_ij − x_i is rescaled so that the force ρ_ij (u_ij − x_i) stays the same. Where some ψ are not concave,
+no ρ falls: the local step has no minimum when ρ is below the negative curvature of f_i.
+
+Start. The points u start inside the team's region even where the bodies start far from it: any start converges, but a start far away costs
+rounds.
 """
 
 from __future__ import annotations
@@ -32,15 +35,15 @@ from consat.protocols.local.proximal import Memory
 
 
 class AdmmState(NamedTuple):
-    """What an agent remembers.
+    """State of an agent.
 
     Attributes:
         x: (rows, d) estimates.
-        u: (links, d) the points of its links.
-        wish: (rows,) ρ_i.
+        u: (links, d) the points u_ij.
+        wish: (rows,) ρ_i, the penalty that the agent wants.
         heard: (links,) ρ_j, as last received.
-        penalty: (links,) ρ_ij in force.
-        memory: of its solver.
+        penalty: (links,) ρ_ij, as used in the last step.
+        memory: warm start of the local solver.
     """
 
     x: Array
@@ -53,19 +56,19 @@ class AdmmState(NamedTuple):
 
 @dataclass(frozen=True)
 class Admm:
-    """See the module.
+    """Gains of relaxed ADMM; the equations are in the module docstring.
 
     Attributes:
-        relaxation: a in (0, 1); above 1/2 is over-relaxed, …
-        cautious: … which only convex teams are: where some ψ are not concave a is at most this. With more they fell into cycles.
-        penalty: ρ at the start, in 1/length².
-        share: of the stiffness, that ρ_i moves towards.
-        least: of the penalty at the start, below which ρ_i does not fall: agents with room to spare have no stiffness to speak of.
-        rise: by which part ρ_i may rise in a round, …
-        hurry: … and how many times that is added where f_i is 1 or more, as it is while constraints are violated: agents with separations
-            can turn about each other in a cycle, which a stiffer penalty of theirs breaks.
-        fall: by which part it may fall while a message crosses the team, once the agent knows that all are satisfied.
-        horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
+        relaxation: a in (0, 1); above 1/2 is over-relaxed.
+        cautious: upper bound on a where some ψ are not concave. With a larger a such teams fell into cycles.
+        penalty: initial ρ, in 1/length² of the team's unit of length.
+        share: fraction of the stiffness of f_i that ρ_i moves towards.
+        least: lower bound on ρ_i, as a fraction of the initial ρ. Agents with room to spare have almost no stiffness.
+        rise: relative increase of ρ_i in a round, at most.
+        hurry: factor of an additional increase, `hurry` · `rise`, where f_i ≥ 1 (constraints violated). Agents with separation constraints
+            can circle about each other; a stiffer penalty breaks that cycle.
+        fall: relative decrease of ρ_i, at most, in the time a message needs to cross the team, once all are known to be satisfied.
+        horizon: number of such crossings after which changes of ρ fade out, so that the convergence proof for fixed ρ applies.
     """
 
     relaxation: float = 0.7

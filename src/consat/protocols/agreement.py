@@ -1,22 +1,22 @@
-"""How agents know that all are satisfied, without learning whose margin is what: min-consensus on ages.
+"""Distributed detection that all constraints of a cluster are satisfied: min-consensus on ages. No margin is disclosed.
 
-Each agent counts the rounds for which its own constraints have held, but counts no farther than one more than the smallest count a
-neighbour last told it:
+The age of an agent is the number of rounds for which its own constraints have held, limited to one more than the smallest age that it last
+received from a neighbour:
 
     age_i⁺ = 1 + min(age_i, min_j age_ij)   while its constraints hold, else 0
 
-An age above the number of hops across the cluster means that everybody's constraints held, each within the last so many rounds it heard
-from. A lost message leaves age_ij as it was, so that it can only hold the count back.
+An age above the number of hops across the cluster means that the constraints of every agent held, as of the last ages that have reached
+this agent. A lost message leaves age_ij unchanged, so that message loss can only delay the detection.
 
-Where do constraints hold? A protocol paces itself by its estimates (`Ages`): what it looks for is found once they satisfy everything.
-A team is satisfied when its bodies are (`Bodies`). Where bodies do not follow at once, every agent says with each message where its own
-is. Agents that hold a copy of a position pass the newest word of the body on over the links of that copy, with the number s of rounds that
-it has been on its way. Agent i hears of the body b_j from its neighbours k,
+The constraints are evaluated at two kinds of positions. `Ages` evaluates them at the estimates: protocols use it to pace themselves.
+`Bodies` evaluates them at the measured positions of the bodies, which decide whether the team is satisfied. Where the bodies lag behind the
+estimates, every agent adds the measured position of its body to each message. Agents that hold a copy of a position forward the newest
+measurement over the links of that copy, with its age s in rounds. Agent i receives the measurement b_j from its neighbours k:
 
     b_j^(i) ← b_j^(k),  s_j^(i) ← s_j^(k) + 1   where s_j^(k) < s_j^(i);   otherwise  s_j^(i) ← s_j^(i) + 1
 
-from j alone where that is a neighbour, so that nobody speaks for an agent that speaks for itself. Its constraints hold when they do at
-its own measured position and at these; one that does not know where it is, or has not heard of a body yet, counts nothing.
+Where j itself is a neighbour, measurements of j are accepted from j alone. The constraints of an agent count as satisfied when they hold at
+its own measured position and at the received ones. The age of an agent is 0 while its own position or one of the received ones is unknown.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from consat.numerics import on_device, pick
 from consat.protocols.base import Solver
 
 NEVER: Final = 1e6
-"""Word that has been on its way for so many rounds is none."""
+"""Age in rounds, from which on a measurement of a body counts as not received."""
 
 
 class Ages(NamedTuple):
-    """What an agent remembers.
+    """State of the detection.
 
     Attributes:
-        age: one number an agent.
+        age: (N,) age of each agent, in rounds.
         heard: (links,) the neighbours' ages, as last received.
     """
 
@@ -47,11 +47,11 @@ class Ages(NamedTuple):
 
 
 class Owners(NamedTuple):
-    """Whose positions the copies are.
+    """Ownership of the copies.
 
     Attributes:
         own: (agents,) the row of each agent's own position.
-        source: (links,) whether word of the body may come over that end of a link.
+        source: (links,) whether measurements of the body are accepted over that end of a link.
     """
 
     own: Array
@@ -59,7 +59,14 @@ class Owners(NamedTuple):
 
     @classmethod
     def of(cls, own: np.ndarray, row: np.ndarray, direct: np.ndarray, rows: int) -> Owners:
-        """Args: own; row: (links,) the copy at each end; direct: (links,) whether the neighbour there owns the position; rows: how many."""
+        """Compute which ends of links may deliver measurements.
+
+        Args:
+            own: (agents,) the row of each agent's own position.
+            row: (links,) the row of the copy at each end of a link.
+            direct: (links,) whether the neighbour at the other end owns that position.
+            rows: number of rows.
+        """
         closed = np.zeros(rows, dtype=bool)
         closed[row[direct]] = True
         closed[own] = True
@@ -67,12 +74,12 @@ class Owners(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """What an agent knows of bodies.
+    """State of the forwarding of measured positions.
 
     Attributes:
-        position: (rows, d) where its own is, and where it last heard that the others are.
-        stale: (rows,) for how many rounds each has been on its way; `NEVER` before it was heard of.
-        ages: of those whose constraints hold there.
+        position: (rows, d) the newest measured position of each body, as known to the holder of the row.
+        stale: (rows,) age of that measurement in rounds; `NEVER` before the first one.
+        ages: detection state, with constraints evaluated at `position`.
     """
 
     position: Array
@@ -81,12 +88,12 @@ class Bodies(NamedTuple):
 
 
 class Word(NamedTuple):
-    """What is told of bodies over each link.
+    """Message about bodies over each link.
 
     Attributes:
-        position: (links, d).
-        stale: (links,).
-        age: (links,).
+        position: (links, d) newest measured position of the shared copy.
+        stale: (links,) age of that measurement in rounds.
+        age: (links,) age of the sender in the detection.
     """
 
     position: Array
@@ -95,12 +102,12 @@ class Word(NamedTuple):
 
 
 def start(x: Array, solver: Solver) -> Ages:
-    """Nobody knows anything; x are the first estimates."""
+    """Initial state: every age is 0. `x`: (rows, d) initial estimates."""
     return Ages(jnp.zeros_like(solver.margin(x)), jnp.zeros_like(solver.links.at(x[:, 0])))
 
 
 def speak(ages: Ages, x: Array, solver: Solver) -> tuple[Ages, Array]:
-    """The next ages, given the estimates, and the message: one number a link."""
+    """Advance the ages by one round, with constraints evaluated at `x`, (rows, d). Returns the state and the message, (links,)."""
     return _counted(ages, solver.margin(x) > 0, solver)
 
 
@@ -110,22 +117,22 @@ def _counted(ages: Ages, hold: Array, solver: Solver) -> tuple[Ages, Array]:
 
 
 def hear(ages: Ages, message: Array, arrived: Array) -> Ages:
-    """Take in what came."""
+    """Store the received ages. `message`: (links,); `arrived`: (links,) whether each message arrived."""
     return Ages(ages.age, jnp.where(arrived, message, ages.heard))
 
 
 def known(ages: Ages, solver: Solver) -> Array:
-    """For how many rounds each agent has known that all are satisfied; 0 while it doesn't."""
+    """(N,) number of rounds for which each agent has known that all agents are satisfied; 0 while it does not know."""
     return jnp.maximum(ages.age - solver.hops, 0.0)
 
 
 def start_bodies(x: Array, solver: Solver) -> Bodies:
-    """No body was heard of; x are the first estimates, (rows, d)."""
+    """Initial state: no measurement has been received. `x`: (rows, d) initial estimates."""
     return Bodies(x, jnp.full_like(x[:, 0], NEVER), start(x, solver))
 
 
 def speak_bodies(bodies: Bodies, measured: Array, owners: Owners, solver: Solver) -> tuple[Bodies, Word]:
-    """The next knowledge, given where the agents' own bodies are, (agents, d), NaN where that is not known; and the message."""
+    """Advance by one round. `measured`: (agents, d) positions of the bodies, NaN where unknown. Returns the state and the message."""
     sure = jnp.isfinite(measured).all(axis=1)
     before = pick(bodies.position, owners.own)
     position = bodies.position.at[owners.own].set(jnp.where(sure[:, None], measured, before))
@@ -136,12 +143,12 @@ def speak_bodies(bodies: Bodies, measured: Array, owners: Owners, solver: Solver
 
 
 def all_heard(bodies: Bodies, solver: Solver) -> Array:
-    """Of each agent, whether it has heard of every body of which it holds a copy."""
+    """(N,) whether each agent has a measurement of every body of which it holds a copy."""
     return solver.least(-solver.links.at(bodies.stale)) > -NEVER
 
 
 def hear_bodies(bodies: Bodies, word: Word, arrived: Array, owners: Owners, solver: Solver) -> Bodies:
-    """Take in what came."""
+    """Store the received ages, and for every row the newest of the received measurements if it is newer than the one held."""
     links, ages = solver.links, hear(bodies.ages, word.age, arrived)
     aged = jnp.minimum(bodies.stale + 1.0, NEVER)
     if not len(word.stale):
@@ -150,6 +157,6 @@ def hear_bodies(bodies: Bodies, word: Word, arrived: Array, owners: Owners, solv
     newest = links.least(offered)
     newer = newest < aged
     number = jnp.arange(len(offered), dtype=offered.dtype)
-    first = links.least(jnp.where(offered == links.at(newest), number, jnp.inf))  # of several as new
+    first = links.least(jnp.where(offered == links.at(newest), number, jnp.inf))  # the first of several with the same age
     position = pick(word.position, jnp.where(newer, first, 0.0).astype(jnp.int32))
     return Bodies(jnp.where(newer[:, None], position, bodies.position), jnp.where(newer, newest, aged), ages)

@@ -1,7 +1,7 @@
-"""What a protocol is: functions of ONE agent's own state, own objective and disagreement with its neighbours' messages.
+"""Interfaces of a protocol: functions of ONE agent's own state, its own objective and the messages of its neighbours.
 
-Every array has one row a copy the agent holds. `consat.engine` passes the rows of all agents at once, a networked agent only its own:
-the functions cannot tell, because nothing in their arguments speaks of another agent's constraints.
+Every array has one row for each copy that the agent holds. `consat.engine` passes the rows of all agents at once; a networked agent passes
+only its own rows. The functions are the same in both cases, because no argument contains another agent's constraints.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from consat.protocols.local.proximal import Memory
 
 
 class State(NamedTuple):
-    """What an agent remembers in continuous time.
+    """State of an agent in continuous time.
 
     Attributes:
-        x: (rows, d) its estimates of the positions it holds, its own among them.
+        x: (rows, d) its estimates of the positions of which it holds copies, its own position included.
         z: (rows, d) the integral of its disagreement.
     """
 
@@ -28,55 +28,55 @@ class State(NamedTuple):
 
 
 class Local(Protocol):
-    """What an agent can ask of itself in continuous time."""
+    """Local objective of an agent, as a continuous-time protocol sees it."""
 
     @property
     def own(self) -> Array:
-        """(rows, 1) 1.0 on the row of its own position, 0.0 on the copies of others'."""
+        """(rows, 1) 1.0 on the row of its own position, 0.0 on the copies of other agents' positions."""
         ...
 
     def gradient(self, x: Array) -> Array:
-        """∇f_i at its estimates; (rows, d)."""
+        """(rows, d) ∇f_i at the estimates `x`, (rows, d)."""
         ...
 
     def ascent(self, x: Array) -> Array:
-        """∇α_i at its estimates; (rows, d)."""
+        """(rows, d) ∇α_i at the estimates `x`, (rows, d)."""
         ...
 
 
 class Flow(Protocol):
-    """A protocol in continuous time."""
+    """A continuous-time protocol."""
 
     @property
     def name(self) -> str:
-        """What ``--protocol`` calls it."""
+        """Name of the protocol in ``--protocol``."""
         ...
 
     def start(self, x: Array) -> State:
-        """The state with which an agent begins from first estimates x."""
+        """Initial state for the initial estimates `x`, (rows, d)."""
         ...
 
     def message(self, state: State) -> Any:
-        """What the agent sends to its neighbours: (rows, d) arrays, of which each gets the rows that both hold."""
+        """Message to the neighbours: arrays of shape (rows, d). Each neighbour receives the rows of the positions that it also holds."""
         ...
 
     def rate(self, state: State, local: Local, disagreement: Any) -> State:
-        """d/dt of the state.
+        """Time derivative of the state.
 
         Args:
-            state: own.
-            local: own constraints.
-            disagreement: Σ_j (m_i − m_j) over the neighbours, for every array of the message.
+            state: state of the agent.
+            local: local objective of the agent.
+            disagreement: Σ_j (m_i − m_j) over the neighbours j, for every array m of the message; (rows, d).
         """
         ...
 
 
 class Known(NamedTuple):
-    """What an agent knows of the bodies; one number an agent.
+    """Knowledge of each agent about the bodies; arrays of shape (N,).
 
     Attributes:
-        satisfied: for how many rounds it has known that all are satisfied; see `consat.protocols.agreement`.
-        margin: ᾱ_i where its own body is and where it last heard that the others are.
+        satisfied: number of rounds for which it has known that all agents are satisfied; see `consat.protocols.agreement`.
+        margin: ᾱ_i at the measured position of its own body and the last received positions of the others.
     """
 
     satisfied: Array
@@ -84,20 +84,20 @@ class Known(NamedTuple):
 
 
 class Links(Protocol):
-    """An agent's own ends of its links: one for each copy that it shares with a neighbour."""
+    """The ends of links at an agent: one for each copy that it shares with a neighbour."""
 
     @property
     def degree(self) -> Array:
-        """(rows,) how many links share each copy."""
+        """(rows,) number of links that share each copy."""
         ...
 
     @property
     def metropolis(self) -> Array:
-        """(links,) weight of each link, 1/(1 + the larger degree of its two ends), for which neighbours tell each other their degrees."""
+        """(links,) Metropolis weight 1/(1 + max(degree of both ends)). Neighbours exchange their degrees to compute it."""
         ...
 
     def at(self, rows: Array) -> Array:
-        """(rows, …) → (links, …): to each link the value of its copy."""
+        """(rows, …) → (links, …): the value of each link's copy."""
         ...
 
     def sum(self, links: Array) -> Array:
@@ -110,21 +110,21 @@ class Links(Protocol):
 
 
 class Solver(Protocol):
-    """What an agent can ask of itself in rounds."""
+    """Local computations that a protocol in rounds may use. Common knowledge is the same for every agent of the team."""
 
     @property
     def links(self) -> Links:
-        """Its ends of its links."""
+        """The ends of links at the agent."""
         ...
 
     @property
     def length(self) -> Array:
-        """The team's unit of length, common knowledge: the scenario's scale."""
+        """() the team's unit of length, from the scale of the scenario; common knowledge."""
         ...
 
     @property
     def hops(self) -> int:
-        """Links that a message crosses, at most, from one agent of a cluster to another; common knowledge."""
+        """Largest number of links between two agents of a cluster; common knowledge."""
         ...
 
     @property
@@ -134,83 +134,89 @@ class Solver(Protocol):
 
     @property
     def interior(self) -> Interior | None:
-        """Its part in `consat.protocols.interior_point`; None unless the protocol speaks to pairs."""
+        """Local step of `consat.protocols.interior_point`; None unless the protocol sends one message per pair."""
         ...
 
     def nearby(self, x: Array) -> Array:
-        """(rows, d) positions, brought to where the team's places are, which is common knowledge: unchanged inside, and from far away to
-        their rim, keeping their directions. Rows that nothing ties to anything stay."""
+        """(rows, d) the positions `x`, moved into the team's region, which is common knowledge. Positions inside stay unchanged. Positions
+        far away are moved to the rim and keep their directions. Rows without links and constraints stay unchanged."""
         ...
 
     def recall(self, x: Array, kappa: Array) -> Memory:
-        """What its solver remembers before the first step from x, (rows, d), at weights κ, (rows,)."""
+        """Initial warm start of the local solver for the first step from `x`, (rows, d), with weights κ, (rows,)."""
         ...
 
     def prox(self, v: Array, kappa: Array, x: Array, memory: Memory) -> tuple[Array, Memory, Array]:
-        """argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖².
+        """Proximal step argmin_y f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖².
+
+        Args:
+            v: (rows, d) centre of the quadratic term.
+            kappa: (rows,) weights κ.
+            x: (rows, d) where the solver starts.
+            memory: warm start from the last step.
 
         Returns:
-            (rows, d) the solution, the solver's memory, and (rows,) the mean diagonal of ∇²f_i, NaN where no constraint reads a row.
+            (rows, d) the solution, the new warm start, and (rows,) the mean diagonal of ∇²f_i; NaN in rows that no constraint reads.
         """
         ...
 
     def margin(self, x: Array) -> Array:
-        """ᾱ_i at its estimates, one number an agent; +∞ without constraints."""
+        """(N,) ᾱ_i at the estimates `x`, (rows, d); +∞ without constraints."""
         ...
 
     def to_rows(self, numbers: Array) -> Array:
-        """One number an agent → (rows,)."""
+        """(N,) → (rows,): the value of the agent that holds each row."""
         ...
 
     def least(self, numbers: Array) -> Array:
-        """(links,) → the smallest over all of an agent's links, one number an agent; +∞ without links."""
+        """(links,) → (N,): the smallest over all links of each agent; +∞ without links."""
         ...
 
 
 class Rounds(Protocol):
-    """A protocol in rounds. In each, an agent speaks once, then hears what arrives."""
+    """A protocol in rounds. In each round every agent sends once (`speak`), then receives (`hear`)."""
 
     @property
     def per(self) -> Mapping[str, Any]:
-        """For each field of the state, what it has one of: ``row``, ``link``, ``agent``, ``pair`` of neighbours, or ``constraint``."""
+        """Leading axis of each field of the state: ``row``, ``link``, ``agent``, ``pair`` of neighbours, or ``constraint``."""
         ...
 
     @property
     def speaks(self) -> str:
-        """What a message has one row of: ``link``, for each copy that two neighbours share, or ``pair``, for each neighbour."""
+        """Leading axis of a message: ``link``, one row for each copy that two neighbours share, or ``pair``, one row for each neighbour."""
         ...
 
     @property
     def name(self) -> str:
-        """What ``--protocol`` calls it."""
+        """Name of the protocol in ``--protocol``."""
         ...
 
     def earliest(self, solver: Solver) -> int:
-        """The round before which to stand still means nothing."""
+        """First round from which a small step may count as convergence."""
         ...
 
     def start(self, x: Array, solver: Solver) -> Any:
-        """The state with which an agent begins from first estimates x; its field ``x`` holds its estimates from then on."""
+        """Initial state for the initial estimates `x`, (rows, d). The field ``x`` of a state always holds the estimates."""
         ...
 
     def speak(self, state: Any, solver: Solver, round_: Array, known: Known) -> tuple[Any, Any]:
-        """Its step, and its message: arrays with one row of what `speaks` says.
+        """Advance the state by one round. Returns the state and the message, whose leading axis is named by `speaks`.
 
         Args:
-            state: own.
-            solver: own.
-            round_: which round it is, from 0.
-            known: of the bodies.
+            state: state of the agent.
+            solver: local computations of the agent.
+            round_: number of the round, from 0.
+            known: what the agent knows about the bodies.
         """
         ...
 
     def hear(self, state: Any, message: Any, arrived: Array, solver: Solver) -> Any:
-        """Take in what came.
+        """Update the state with the received messages.
 
         Args:
-            state: own.
-            message: as the other ends sent it.
-            arrived: (links,) whether it did; where not, the message holds nothing of use.
-            solver: own.
+            state: state of the agent.
+            message: the messages of the other ends.
+            arrived: (links,) whether each message arrived; where it did not, the entries of `message` are meaningless.
+            solver: local computations of the agent.
         """
         ...

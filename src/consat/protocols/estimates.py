@@ -1,8 +1,9 @@
-"""Who holds a copy of whose position, and the consensus between copies.
+"""Layout of the copies (which agent holds a copy of which position), and the consensus between copies.
 
-State is one row per copy (holder, position), ordered by holder, so an agent's rows stand together. "full" is the paper's layout: every
-agent holds every position of its cluster. "local" holds only what is needed: every convergence proof of the full scheme carries over,
-since the null space of the block Laplacian is still "all copies of each x_j agree" (arXiv 2203.00681, 1805.08460).
+The state has one row per copy (holder, position), sorted by holder, so that the rows of an agent are contiguous. In the layout "full", as
+in the paper, every agent holds every position of its cluster. In the layout "local" an agent holds only the positions that it needs. Every
+convergence proof of the full layout carries over: the null space of the block Laplacian is still the set where all copies of each x_j
+agree (arXiv 2203.00681, 1805.08460).
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ Layout = Literal["full", "local"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Exchange:
-    """The messages between copies: one directed edge for each pair of linked agents that both hold a position.
+    """Directed edges between copies: one for each direction of a link and each position that both ends hold.
 
     Attributes:
-        sender: (E,) row whose value arrives; the edges are ordered by receiver.
-        arrivals: groups the edges by receiving row.
-        block: rows move in blocks of this many: the agents' whole estimates where all hold all, else single rows.
+        sender: (E,) sending row, in units of blocks; the edges are sorted by receiver.
+        arrivals: groups the edges by receiving row, in units of blocks.
+        block: number of rows that are sent together: all rows of an agent where every agent holds every position, else 1.
     """
 
     sender: Array
@@ -39,7 +40,7 @@ class Exchange:
     block: int = field(metadata={"static": True})
 
     def disagreement(self, message: Any) -> Any:
-        """Σ_j (m_i − m_j) over the neighbours j that share the copy: the Laplacian, applied to every (rows, …) array of `message`."""
+        """Σ_j (m_i − m_j) over the neighbours j that share the copy: the Laplacian applied to every (rows, …) array of `message`."""
 
         def laplacian(m: Array) -> Array:
             blocks = m.reshape(-1, self.block, *m.shape[1:])
@@ -54,8 +55,8 @@ class Estimates:
 
     Attributes:
         layout: ``full`` or ``local``.
-        holder: (C,) who holds each copy.
-        position: (C,) whose position it is.
+        holder: (C,) agent that holds each copy.
+        position: (C,) agent whose position it is.
         own: (N,) the row of each agent's own position.
         edges: (E, 2) directed edges (receiver, sender) between copies of the same position on linked agents, by receiver.
         cluster: (N,) the cluster of each agent.
@@ -72,7 +73,12 @@ class Estimates:
 
     @classmethod
     def of(cls, team: Team, layout: Layout) -> Estimates:
-        """Raises: InvalidTeam: where a cluster is not connected (Assumption 1). InvalidSettings: no such layout."""
+        """Lay out the copies of a team.
+
+        Raises:
+            InvalidTeam: a cluster is not connected (Assumption 1 of the paper).
+            InvalidSettings: unknown layout.
+        """
         if layout not in get_args(Layout):
             raise InvalidSettings(f"estimates is {layout!r}, but must be one of {', '.join(get_args(Layout))}")
         require_connected(team)
@@ -88,19 +94,19 @@ class Estimates:
         return len(self.holder)
 
     def rows(self, holder: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """The rows of the copies (holder, position), which must exist; any shape, int32."""
+        """Rows of the copies (holder, position), which must exist; arrays of any shape, result int32."""
         count = len(self.own)
         keys = self.holder.astype(np.int64) * count + self.position
         return np.searchsorted(keys, holder.astype(np.int64) * count + position).astype(np.int32)
 
     def carried(self, before: Estimates, x: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """(C, d) first estimates of agents whose copies were laid out otherwise before: those that they held, and of what is new to them
-        their own place.
+        """(C, d) initial estimates after a change of layout. Copies that existed before keep their value; new copies start at the holder's
+        own position.
 
         Args:
-            before: the layout until now.
-            x: (C', d) estimates until now.
-            place: (N, d) where the agents are.
+            before: the previous layout.
+            x: (C', d) estimates in the previous layout.
+            place: (N, d) positions of the agents.
         """
         rows, found = before.found(self.holder, self.position)
         first = np.where(found[:, None], x[rows], place[self.holder])
@@ -108,26 +114,26 @@ class Estimates:
         return first
 
     def found(self, holder: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(…,) the rows of the copies (holder, position), and (…,) whether they exist."""
+        """(…,) rows of the copies (holder, position), and (…,) whether they exist; the row is arbitrary where the copy does not exist."""
         rows = np.minimum(self.rows(holder, position), self.count - 1)
         return rows, (self.holder[rows] == holder) & (self.position[rows] == position)
 
     def ends(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Both ends of every link of every row: (B,) receivers, in order, (B,) senders, and how many rows make a block, in which both are
-        counted: agents' whole estimates where everyone holds everything, which makes one Laplacian for all positions; else single rows."""
+        """(B,) receivers, sorted, (B,) senders, and the number of rows of a block. Receivers and senders are indices of blocks. Where every
+        agent holds every position, a block is all rows of an agent, so that one Laplacian serves all positions; else a block is one row."""
         agents = len(self.own)
         if self.count == agents**2 and self.count:
             return *_both_ways(self.links, agents), agents
         return self.edges[:, 0], self.edges[:, 1], 1
 
     def exchange(self) -> Exchange:
-        """The edges as arrays for the device."""
+        """The edges as arrays on the device."""
         receiver, sender, block = self.ends()
         return Exchange(on_device(sender), Groups.of(receiver, self.count // block), block)
 
 
 def _everyone(team: Team, cluster: np.ndarray) -> np.ndarray:
-    """Pairs (holder, position): every agent holds every position of its cluster, and relays those of the clusters that they join."""
+    """Pairs (holder, position): agents hold every position of their cluster, relays also those of the clusters that they connect."""
     order = np.argsort(cluster, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1)
     holding = [(group, group) for group in members]
@@ -137,7 +143,7 @@ def _everyone(team: Team, cluster: np.ndarray) -> np.ndarray:
 
 
 def _shared(pairs: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
-    """Edges between rows: for each link and direction, the positions that both ends hold."""
+    """(E, 2) edges (receiver, sender) between rows: for each direction of a link, the positions that both ends hold."""
     keys = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
     here, there = _both_ways(links, count)
     offsets = np.searchsorted(pairs[:, 0], np.arange(count + 1, dtype=pairs.dtype))
@@ -152,7 +158,7 @@ def _shared(pairs: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
 
 
 def _both_ways(links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Every link in both directions, (2L,) and (2L,), sorted by the first."""
+    """Every link in both directions, (2L,) and (2L,), sorted by the first array."""
     low, high = links.astype(np.int64).T
     keys = np.sort(np.concatenate([low * count + high, high * count + low]))
     here, there = np.divmod(keys, max(count, 1))
@@ -160,7 +166,7 @@ def _both_ways(links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _used(talkers: np.ndarray, count: int) -> np.ndarray:
-    """(L, 2) the links, i < j, each once, between the agents at both ends of (E, 2) edges."""
+    """(L, 2) distinct links (i, j), i < j, between the agents at both ends of edges. `talkers`: (E, 2) the agents of each edge."""
     keys = distinct(talkers[:, 0].astype(np.int64) * count + talkers[:, 1])
     links = np.stack([keys // count, keys % count], axis=1).astype(np.int32)
     return links[links[:, 0] < links[:, 1]]

@@ -18,7 +18,7 @@ from consat.protocols.base import Local, State
 
 @dataclass(frozen=True)
 class GradientFlow:
-    """See the module.
+    """Gains of the gradient flow; the equations are in the module docstring.
 
     Attributes:
         k1: gain on the gradient, 1/s.

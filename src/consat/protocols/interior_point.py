@@ -1,23 +1,26 @@
-"""Max-min by an interior point whose Newton steps are passed along as quadratics, one hop a round (after Khoshfetrat Pakazad, Hansson,
-Andersen, arXiv 1502.06384, who sweep the whole tree for each step).
+"""Distributed primal-dual interior-point method for the max-min problem
 
-    max t   subject to   ψ_ik(x) ≥ t
+    max t   subject to   ψ_ik(x) ≥ t.
 
-has strictly feasible points wherever the team is: lower t. Agent i holds copies y of the positions it needs, a level t_i, multipliers
-λ_ik > 0 and a barrier μ_i. In each round, with s_k = ψ_k(y) − t_i > 0 and a_k = (∇ψ_k, −1),
+Agents send quadratic functions to their neighbours, one hop a round (after Khoshfetrat Pakazad, Hansson, Andersen, arXiv 1502.06384, who
+sweep the whole tree for each Newton step). Every x is strictly feasible for a low enough t. Agent i holds copies y of the positions that it
+needs, a level t_i, multipliers λ_ik > 0 and a barrier parameter μ_i. Each round, with s_k = ψ_k(y) − t_i > 0 and a_k = (∇ψ_k, −1), is
 
     M   = Σ_k (λ_k/s_k) a_k a_kᵀ − Σ_k λ_k ∇²ψ_k + κ I,     g = −e_t − Σ_k (μ_i/s_k) a_k
-    Δ   = −(M + A)⁻¹ (g + A y − b),                          A, b: the neighbours' last quadratics ½ zᵀLz − eᵀz, added up
-    y⁺  = y + α Δ,   λ⁺ = λ + (μ/s − λ − (λ/s) aᵀΔ),         cut so that a part of every slack and multiplier is left
-    μ⁺  = max(σ λ·s/m,  floor,  μ_j/3,  0.1 |t_j − t_i|)
+    Δ   = −(M + A)⁻¹ (g + A y − b),                          A, b: sums over the neighbours' last quadratics ½ zᵀLz − eᵀz
+    y⁺  = y + α Δ,   λ⁺ = λ + (μ/s − λ − (λ/s) aᵀΔ),         shortened so that slacks and multipliers stay positive
+    μ⁺  = max(σ λ·s/m,  floor,  μ_j/couple,  apart |t_j − t_i|)
     send j:  the quadratic of M + A − A_j, minimised over all variables not shared with j;  μ_i, t_i
 
-A lost message leaves the last one in force; nothing has to be in step. Of ∇²ψ only the concave part counts. The level travels along a
-spanning tree, and with it a proof: Σ λψ of everything behind the sender, maximised likewise. Own plus all that came is a bound on the best
-margin of the whole team, whatever was lost, late or stale, since any multipliers give one. An agent whose bound is below zero knows that
-the team cannot be satisfied.
+A lost message leaves the last one in force; no synchronization is needed. Only the concave part of ∇²ψ enters M.
 
-With a cap the level is at most that: no more margin is asked for, and far parts of a team need not agree on t. `max-min` has none.
+Bound. The level travels along a spanning tree. With it each agent sends a quadratic upper bound on Σ λψ over all agents behind the sender,
+maximised over the variables that the receiver does not share. The sum of an agent's own part and all received parts bounds the best margin
+of the whole team. The bound holds whatever was lost, late or outdated, because any multipliers give a valid bound. An agent whose bound is
+below zero knows that the team cannot be satisfied.
+
+Cap. With a cap, the level is at most the cap: the team asks for no more margin, and distant parts of a team need not agree on t. `max-min`
+has no cap.
 """
 
 from __future__ import annotations
@@ -36,11 +39,11 @@ from consat.protocols.local.interior import Gains, Interior, Mail, Memory
 
 
 class InteriorState(NamedTuple):
-    """What an agent remembers.
+    """State of an agent.
 
     Attributes:
-        memory: of its own problem, its estimates among it.
-        inbox: what it last heard over each end of a link.
+        memory: state of the local step, which contains the estimates.
+        inbox: the last message received over each end of a link.
     """
 
     memory: Memory
@@ -54,20 +57,21 @@ class InteriorState(NamedTuple):
 
 @dataclass(frozen=True)
 class InteriorPoint:
-    """See the module.
+    """Gains of the interior-point protocol; the equations are in the module docstring.
 
     Attributes:
-        cap: of the level, in the team's unit of ψ; None for the exact max-min.
-        inertia: κ at least, in units of ∇²ψ: keeps agents where they are that have what they need. Agents that swing raise theirs.
+        cap: upper bound on the level, in the team's unit of ψ; None for the exact max-min.
+        inertia: lower bound on κ, in units of ∇²ψ. It keeps agents with satisfied constraints in place. Oscillating agents raise their κ.
         centering: σ.
-        boundary: the part of any slack or multiplier that a step may take.
-        floor: of μ, relative to the level or in the team's unit of ψ.
-        couple: μ_i is at least a neighbour's over this.
-        apart: μ_i is at least this part of how far levels differ.
-        drop: an agent comes down at once to the lowest level heard, if that is below by more than so many times its least slack.
-        warm: rounds in which agents whose margins are below `far` at the start maximise the mean of these first, where all are quadratic.
-        far: below minus this, in the team's unit of ψ.
-        name: what ``--protocol`` calls it.
+        boundary: largest fraction of any slack or multiplier that one step may remove.
+        floor: lower bound on μ, relative to the level or in the team's unit of ψ.
+        couple: μ_i is at least μ_j / `couple` for every neighbour j.
+        apart: μ_i is at least `apart` · |t_j − t_i| for every neighbour j.
+        drop: an agent lowers its level at once to the lowest level received, if the difference exceeds `drop` times its smallest slack.
+        warm: number of initial rounds in which an agent maximises the mean of its margins instead. It applies to agents with only quadratic
+            ψ and an initial margin below −`far`.
+        far: see `warm`; in the team's unit of ψ.
+        name: name of the protocol in ``--protocol``.
     """
 
     cap: float | None = 0.3
@@ -89,7 +93,7 @@ class InteriorPoint:
 
     @property
     def gains(self) -> Gains:
-        """What a step needs to know of them."""
+        """The gains as the local step takes them."""
         return Gains(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Gains)})
 
     def earliest(self, solver: Solver) -> int:
@@ -110,7 +114,16 @@ class InteriorPoint:
         return state._replace(inbox=jax.tree.map(take, message, state.inbox))
 
     def proven(self, state: InteriorState, solver: Solver, margin: Array) -> tuple[Array, Array]:
-        """What each agent knows of the whole team: (N,) a bound on its best margin, and (N,) the margin it has; `margin`: (N,) own."""
+        """What each agent knows about the whole team.
+
+        Args:
+            state: state of the agents.
+            solver: local computations of the agents.
+            margin: (N,) own margin of each agent.
+
+        Returns:
+            (N,) an upper bound on the team's best margin, and (N,) the team's present margin.
+        """
         interior = _own(solver)
         return state.memory.bound * interior.units.psi, interior.least(state.inbox, margin)
 
@@ -121,15 +134,21 @@ def _own(solver: Solver) -> Interior:
 
 
 NEARLY, EXACTLY = 0.05, 1e-3
-"""Near the best is within this part of the bound, or within `EXACTLY` in units of ψ."""
+"""A margin is near the best if its gap to the bound is at most `NEARLY` times |bound|, or at most `EXACTLY` in units of ψ."""
 
 
 def near(bound: Any, least: Any, unit: Any) -> Any:
-    """Whether a margin is proven to be near the best; bound: on the best, +∞ without proof; unit: of ψ."""
+    """Whether the margin `least` is proven to be near the best.
+
+    Args:
+        bound: upper bound on the best margin; +∞ without proof.
+        least: the team's margin.
+        unit: the team's unit of ψ.
+    """
     gap = bound - least
     return (bound < jnp.inf) & ((gap <= NEARLY * abs(bound)) | (gap <= EXACTLY * unit))
 
 
 def max_min() -> InteriorPoint:
-    """The same without a cap."""
+    """`InteriorPoint` without a cap."""
     return InteriorPoint(cap=None, name="max-min")

@@ -19,7 +19,7 @@ from consat.protocols.base import Local, State
 
 @dataclass(frozen=True)
 class ProportionalIntegral:
-    """See the module."""
+    """Proportional–integral flow; the equations are in the module docstring."""
 
     name = "proportional-integral"
 

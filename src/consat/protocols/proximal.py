@@ -1,11 +1,11 @@
-"""P-EXTRA, the gradient flow with its stiff part taken implicitly (Shi, Ling, Wu, Yin 2015): in each round, with Metropolis weights w,
+"""P-EXTRA, an implicit discretization of the gradient flow (Shi, Ling, Wu, Yin 2015). Each round, with Metropolis weights w, is
 
     v  = x − Σ_j w_ij (x − x_j) − z
     z⁺ = z + ½ Σ_j w_ij (x − x_j),          z(0) = 0
     x⁺ = argmin_y f_i(y) + ‖y − v‖²/(2c)
 
-Sends x. It converges for every c > 0 when the ψ are concave, on links that lose nothing: a lost message makes the two ends of a link
-integrate different differences, so that Σ z drifts. `consat.protocols.admm` is its twin for links that do.
+Sends x. It converges for every c > 0 when the ψ are concave and no message is lost. After a lost message the two ends of a link integrate
+different disagreements, and Σ z drifts. Use `consat.protocols.admm` on links that lose messages.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from consat.protocols.local.proximal import Memory
 
 
 class ProximalState(NamedTuple):
-    """What an agent remembers.
+    """State of an agent.
 
     Attributes:
         x: (rows, d) estimates.
         z: (rows, d) integral of the disagreement.
         heard: (links, d) the neighbours' estimates, as last received.
-        memory: of its solver.
+        memory: warm start of the local solver.
     """
 
     x: Array
@@ -39,10 +39,10 @@ class ProximalState(NamedTuple):
 
 @dataclass(frozen=True)
 class Proximal:
-    """See the module.
+    """Gains of P-EXTRA; the equations are in the module docstring.
 
     Attributes:
-        step: c, in length².
+        step: c, in length² of the team's unit of length.
     """
 
     step: float = 0.3

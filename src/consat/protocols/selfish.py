@@ -1,9 +1,9 @@
-"""Selfish ascent, a baseline (paper, remark 5 on the noncooperative game): every agent climbs its own α_i by its own position alone,
+"""Selfish ascent, a baseline (paper, remark 5 on the noncooperative game). Every agent increases its own α_i by moving only itself:
 
     ẋ_i       = k1 ∂α_i/∂x_i
-    ẋ_j^(i)   = −k2 Σ_l (x_j^(i) − x_j^(l))      for the others' positions, which it only follows
+    ẋ_j^(i)   = −k2 Σ_l (x_j^(i) − x_j^(l))      for its copies of the other positions
 
-Sends x^(i). It ends in a Nash equilibrium, which need not satisfy constraints that cooperation can.
+Sends x^(i). It converges to a Nash equilibrium, which may violate constraints that a cooperating team satisfies.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from consat.protocols.base import Local, State
 
 @dataclass(frozen=True)
 class Selfish:
-    """See the module.
+    """Gains of the selfish ascent; the equations are in the module docstring.
 
     Attributes:
         k1: gain on the ascent.

@@ -1,4 +1,4 @@
-"""What an agent can ask of itself in rounds, `consat.protocols.Solver`: the same for all agents of a team at once, and for one alone."""
+"""Implementation of `consat.protocols.Solver`, for all agents of a team at once or for a single agent."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from consat.protocols.local import proximal as prox
 from consat.protocols.local.interior import Interior
 
 EXACT = prox.Precision(tolerance=1e-9)
-"""Of every local step of an agent alone, and of a small team."""
+"""Precision of the local steps of a single agent and of small teams."""
 FLAT = 1e-6
-"""A ψ that changes by less than this, in units of 1/ν, over the team's unit of length, has no slope to climb."""
+"""A ψ that changes by less than this over the team's unit of length, in units of 1/ν, counts as flat."""
 
 
 class Tries(NamedTuple):
-    """How first estimates are moved, one try after the other, (K,) each.
+    """Sequence of K moves of the initial estimates, tried in order; arrays of shape (K,).
 
     Attributes:
-        others: which part of the way to the agent's own position its copies of others are moved.
-        own: which part of the way to the mean of these its own position is.
-        home: which part of the way to the team's middle all are.
-        scale: of random steps, in units of the team's reach.
+        others: fraction of the way by which copies of other positions move towards the agent's own position.
+        own: fraction of the way by which the own position moves towards the mean of these copies.
+        home: fraction of the way by which all move towards the centre of the team's region.
+        scale: standard deviation of an additional random step, in units of the region's reach.
     """
 
     others: Any
@@ -41,7 +41,7 @@ class Tries(NamedTuple):
 
     @classmethod
     def all(cls) -> Tries:
-        """First towards each other, by ever larger parts; then at random, ever farther, from where they are and from the team's middle."""
+        """First moves towards each other by growing fractions, then random steps of growing scale around the estimates and the centre."""
         moves = [(part, 0.0, 0.0, 0.0) for part in PARTS] + [(0.0, part, 0.0, 0.0) for part in PARTS]
         draws = [(0.0, 0.0, home, scale) for scale in SCALES for home in (0.0, 1.0) for _ in range(DRAWS)]
         return cls(*(jnp.array(column) for column in zip(*moves, *draws, strict=True)))
@@ -50,11 +50,11 @@ class Tries(NamedTuple):
 PARTS = (0.5, 0.75, 0.9, 0.97, 0.99)
 SCALES = tuple(2.0**k for k in range(-8, 1))
 DRAWS = 4
-"""Random tries of each scale."""
+"""Number of random tries per scale and starting point."""
 
 
 class Place(NamedTuple):
-    """Where a search for first estimates stands: the number of the try, the estimates, (rows, d), and who is lost there, (N,)."""
+    """State of the search for initial estimates: number of the next try, estimates, (rows, d), and which agents are lost there, (N,)."""
 
     number: Array
     x: Array
@@ -63,17 +63,17 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Footing:
-    """Moves first estimates off where an agent's constraints do not say where to go: where one of its ψ is −∞, or where they are violated
-    and flat (design, section 10).
+    """Moves initial estimates away from places where an agent's constraints have no usable gradient: where one of its ψ is −∞, or where a
+    constraint is violated and all of them are flat (design, section 10). Such an agent is called lost.
 
     Attributes:
         local: the agents' objectives over the copies that they hold.
         nu: the smoothing.
         length: the team's unit of length.
-        region: where the team's places are.
-        holder: (rows,) who holds each copy, in order.
+        region: the team's region.
+        holder: (rows,) the agent that holds each copy, sorted.
         own: (N,) rows of own positions.
-        still: whether these stay where they are, as those of bodies do.
+        still: whether own positions stay fixed, as measured positions of bodies do.
     """
 
     local: Objective
@@ -85,19 +85,19 @@ class Footing:
     still: bool = False
 
     def lost(self, x: Array) -> Array:
-        """(N,) who does not know where to go."""
+        """(N,) which agents are lost at the estimates `x`, (rows, d)."""
         margin = self.local.agent_margins(x)
         slope = jnp.max(jnp.abs(self.local.ascent(x, self.nu)), axis=1)
         steepest = jax.ops.segment_max(slope, self.holder, len(self.own), indices_are_sorted=True)
         return (margin < -HUGE) | ((margin <= 0.0) & (steepest * self.nu.alpha * self.length < FLAT))
 
     def find(self, x: Array) -> Array:
-        """(rows, d) the first of the `Tries` that helps, agent by agent; x where none is needed or none does."""
+        """(rows, d) for each agent the first of the `Tries` at which it is not lost; `x` where none is needed or none helps."""
         if not any(batch.partial for batch in self.local.batches):
             return x
         tries, moved = Tries.all(), self.moves(x)
 
-        def improve(at: Place) -> Place:  # the first try is none, so that ψ is looked at in one place of the program
+        def improve(at: Place) -> Place:  # number 0 tests x itself, so that ψ is compiled only once
             step = moved(at.number, jax.tree.map(lambda each: each[at.number - 1], tries))
             candidate = jnp.where(pick(at.lost, self.holder)[:, None] & (at.number > 0), x + step, at.x)
             return Place(at.number + 1, candidate, self.lost(candidate))
@@ -109,8 +109,8 @@ class Footing:
         return jnp.where(pick(found.lost, self.holder)[:, None], x, found.x)
 
     def moves(self, x: Array) -> Callable[[Array, Tries], Array]:
-        """The step, (rows, d), of a try with its number. What is drawn for a copy hangs on its rank among those of its holder, not on who
-        else there is."""
+        """Function that returns the step, (rows, d), of a try with its number. The random step of a copy depends only on its rank among the
+        copies of its holder, so that it is the same in a team and alone."""
         count, row = len(self.own), jnp.arange(len(x), dtype=self.own.dtype)
         is_own = (pick(self.own, self.holder) == row)[:, None]
         rank = row - jnp.searchsorted(self.holder, self.holder).astype(row.dtype)
@@ -129,20 +129,20 @@ class Footing:
 
 @dataclass(frozen=True)
 class LocalSolver:
-    """Some agents, over the copies that they hold; what is one number an agent has one row an agent.
+    """`consat.protocols.Solver` for a subset of agents. Per-agent scalars have shape (N,).
 
     Attributes:
-        links: their ends of their links.
-        length: the team's unit of length.
-        region: where the team's places are.
-        plan: the agents by shape, for their local steps.
-        precision: of these.
-        interior: their part in `consat.protocols.interior_point`; None of other protocols.
+        links: the ends of links at these agents.
+        length: () the team's unit of length.
+        region: the team's region.
+        plan: the agents in batches, for proximal steps; None for protocols without proximal steps.
+        precision: stopping rule of the proximal steps.
+        interior: local step of `consat.protocols.interior_point`; None for other protocols.
         nu: the smoothing.
         local: every agent's objective over its copies.
-        holder: (rows,) who holds each copy, in order.
+        holder: (rows,) the agent that holds each copy, sorted.
         own: (N,) rows of own positions.
-        talkers: groups the ends by agent.
+        talkers: groups the ends of links by agent.
         hops: see `consat.problem.graphs.hops`.
         convex: whether every ψ of the team is known to be concave.
     """
@@ -162,7 +162,7 @@ class LocalSolver:
     precision: prox.Precision = field(metadata={"static": True})
 
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Self:
-        """The same with other parameters of the constraints; of each family those that are given, (M_f, …)."""
+        """Copy with new constraint parameters. `values`: for each family the parameters to replace, (M_f, …)."""
         interior = self.interior and replace(self.interior, plan=self.interior.plan.with_parameters(values))
         plan = self.plan and self.plan.with_parameters(values)
         return replace(self, local=self.local.with_parameters(values), interior=interior, plan=plan)

@@ -1,4 +1,4 @@
-"""What a user calls, from a scenario to a result: `run` and `resume`, `solve`, and `sweep` over many runs.
+"""User-level functions, from a scenario to a result: `run` and `resume`, `solve`, `sweep` over many runs, and `Session`.
 
-Begin with `runner`. `preparation` makes a team ready and `summary` tells how it ended, for every one of them and for agents on a network.
+Start reading at `runner`. `preparation` prepares a team and `summary` reports how it ended, for all of them and for agents on a network.
 """

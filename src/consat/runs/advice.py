@@ -1,4 +1,4 @@
-"""What of a run its user should be warned of, and what would help, in words."""
+"""Warnings about a run, as sentences that name a remedy."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from consat.protocols.solver import FLAT
 from consat.results.trace import Trace
 
 NAMED = 3
-"""So many agents are named in a warning; of more, their number is told."""
+"""Largest number of constraints that a warning names; of further ones it gives the number."""
 ROUNDS_HELP = next(iter(ROUNDS))
 
 
 def warnings_of(team: Team, trace: Trace, nu: Nu, size: Scale, protocol: str) -> list[str]:
-    """Sentences, none where nothing is to be warned of.
+    """Warnings about a run; empty without any.
 
     Args:
         team: the team.
-        trace: of the run.
-        nu: ν at its end.
-        size: the team's natural size.
-        protocol: its name.
+        trace: trace of the run.
+        nu: ν at the end of the run.
+        size: the team's natural scale.
+        protocol: name of the protocol.
     """
     found = []
     if protocol in FLOWS and trace.ending in ("diverged", "too stiff"):
@@ -36,7 +36,7 @@ def warnings_of(team: Team, trace: Trace, nu: Nu, size: Scale, protocol: str) ->
 
 
 def around_loops(route: str | None, trace: Trace) -> list[str]:
-    """Of a run over links with loops that had not come to rest when its time was up, with some constraint violated."""
+    """Warning about a run over links with loops that ended unsatisfied by its limit of rounds; empty for other runs."""
     if route != "links" or trace.ending != "out of time" or trace.satisfied_from is not None:
         return []
     what = (
@@ -60,7 +60,7 @@ def _flow(trace: Trace, nu: Nu) -> str:
 
 
 def _positions(team: Team, x: Floats, nu: Nu, size: Scale) -> list[str]:
-    """Of agents whose constraints are violated and do not say where to go."""
+    """Warnings about violated constraints without a usable gradient: ψ = −∞, or ψ flat. `x`: (N, d) final positions."""
     values, gradients = values_and_gradients(team, x)
     margins = np.full(team.count, np.inf)
     np.minimum.at(margins, team.owner, values)
@@ -88,7 +88,15 @@ def _positions(team: Team, x: Floats, nu: Nu, size: Scale) -> list[str]:
 
 
 def _slopes(team: Team, values: Floats, gradients: list[Floats], margins: Floats, nu: Nu) -> Floats:
-    """(N,) the largest entry of ∇α_i, over all positions that agent i reads; of agents whose constraints are violated."""
+    """(N,) largest absolute entry of ∇α_i, over all positions that agent i reads; 0 for agents without a violated constraint.
+
+    Args:
+        team: the team.
+        values: (M,) ψ.
+        gradients: for each family ∇ψ, (M_f, arity, d).
+        margins: (N,) margin of each agent.
+        nu: the smoothing.
+    """
     bad = (margins <= 0) & (margins > -np.inf)
     base = np.where(bad, margins, 0.0)[team.owner]
     share = np.where(bad[team.owner], np.exp(np.minimum(-float(nu.alpha) * (values - base), 0.0)), 0.0)
@@ -109,7 +117,7 @@ def _slopes(team: Team, values: Floats, gradients: list[Floats], margins: Floats
 
 
 def _named(team: Team, constraints: np.ndarray) -> str:
-    """``psi of a1's tether is`` …"""
+    """Subject and verb of a sentence about constraints, such as ``psi of a1's tether is``."""
     some = [f"{team.ids[int(team.owner[k])]}'s {team.names[int(k)]}" for k in constraints[:NAMED]]
     more = [] if len(constraints) <= NAMED else [f"{len(constraints) - NAMED} more"]
     listed = [*some, *more]

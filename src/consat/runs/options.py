@@ -1,4 +1,4 @@
-"""How a run is asked for: the arguments of `run`, checked, as one frozen object that a checkpoint can hold."""
+"""Options of a run: the arguments of `run` as one frozen object, with checks; a checkpoint can store it."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from consat.robots.description import Robots
 
 RATE = 20.0
-"""Rounds a second, Hz, where constraints move with time, or robots drive, and nobody says."""
+"""Default rate of rounds, Hz, where constraints move with time or robots drive."""
 WATCHED = 60.0
-"""s; how long a team is followed whose constraints read the time, when nobody says."""
+"""Default duration, s, of a run with constraints that read the time and have no schedule."""
 
 
 class Pace(NamedTuple):
-    """How rounds follow one another.
+    """Number and timing of the rounds.
 
     Attributes:
-        rounds: how many; None until a stop rule says so.
-        least: how many before a stop rule may say so.
-        body: what moves in a round; None where rounds take no time.
+        rounds: number of rounds; None to run until a stop rule holds.
+        least: number of rounds before a stop rule may end the run.
+        body: motion of the bodies in a round; None where rounds take no time.
     """
 
     rounds: int | None
@@ -43,7 +43,7 @@ class Pace(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """See `consat.run`."""
+    """Arguments of `consat.run`; see there."""
 
     protocol: str | None = None
     estimates: Layout | None = None
@@ -69,13 +69,13 @@ class Options:
 
     @property
     def data(self) -> dict[str, Any]:
-        """As JSON can hold them."""
+        """The options as JSON-serialisable data."""
         robots = None if self.robots is None else self.robots.data
         return {field.name: _as_data(getattr(self, field.name)) for field in dataclasses.fields(self)} | {"robots": robots}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
-        """From `data`."""
+        """Options from `data`."""
         from consat.robots.description import Robots
 
         smoothing, robots = data["smoothing"], data["robots"]
@@ -87,7 +87,7 @@ class Options:
         return cls(**{**data, "wind": tuple(data["wind"]), "burst": burst, **made})
 
     def stop_for(self, kind: str) -> Stop:
-        """When a run with a protocol ends before the time or the rounds are up."""
+        """Stop condition of a run with the protocol `kind`."""
         if self.stop is not None:
             return self.stop
         if self.until is not None or self.rounds is not None:
@@ -95,7 +95,7 @@ class Options:
         return "converged" if kind == "max-min" else "satisfied"
 
     def require_flow(self, kind: str, team: Team) -> None:
-        """Raises: InvalidSettings: there is something that continuous time does not know."""
+        """Check the options for a continuous-time protocol. Raises: InvalidSettings: an option applies only to rounds."""
         given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise")}
         given["restarts"] = self.restarts - 1
         if wrong := [name for name, value in given.items() if value]:
@@ -105,7 +105,7 @@ class Options:
             raise InvalidSettings(f"constraints move with time, and protocol {kind} flows without rounds; use a protocol in rounds")
 
     def weather(self, seed: int) -> Weather:
-        """What goes wrong on the way. Raises: InvalidSettings: probabilities that are none."""
+        """Message loss and sleep. Raises: InvalidSettings: a probability is out of range."""
         if not (0 <= self.loss < 1 and 0 <= self.sleep < 1):
             raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
         if self.burst is not None and not (len(self.burst) == 2 and all(0 < each <= 1 for each in self.burst)):
@@ -114,7 +114,7 @@ class Options:
         return Weather(self.loss, self.sleep, seed, self.burst)
 
     def _driven(self, team: Team, rate: float) -> dict[str, Any]:
-        """What robots add to a body."""
+        """Keyword arguments of `Body` for robots; empty without robots. `rate`: rounds per second, Hz."""
         if self.robots is None:
             return {}
         if self.speed is not None:
@@ -130,7 +130,7 @@ class Options:
         return {"drive": drive, "wind": self.wind, "noise": self.noise}
 
     def pace(self, kind: str, team: Team) -> Pace:
-        """How rounds follow one another. Raises: InvalidSettings: what is said of it does not fit together."""
+        """Number and timing of the rounds for the protocol `kind`. Raises: InvalidSettings: the options contradict each other."""
         if self.restarts < 1:
             raise InvalidSettings(f"restarts is {self.restarts}, but must be at least 1: from how many starts to run")
         if self.restarts > 1 and (self.rate is not None or team.moves or self.robots is not None):

@@ -1,4 +1,4 @@
-"""From what is given to a team that is ready to run: its scenario, the settings that hold, the layout of copies and first estimates."""
+"""Preparation of a run: resolves the scenario, the settings, the layout of copies and the initial estimates."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 DEFAULT_PROTOCOL = "interior-point"
 MANY = 5000
-"""Teams of more agents than these run admm where nobody says: its rounds take less time."""
+"""Number of agents above which admm is the default protocol, because its rounds take less time."""
 FULL = 30
-"""Likewise teams of more agents than these where everybody holds everything."""
+"""Number of agents above which admm is the default protocol in the layout ``full``."""
 SHARP = 5e-4
-"""Max-min ends when the margin is proven to be within this, in units of the team's scale of ψ, of the best."""
+"""Gap between the margin and the proven bound at which max-min ends, in the team's unit of ψ."""
 
 
 def robots_of(robots: Any, obstacles: Any, scenario: Scenario) -> Robots | None:
-    """The robots of a run; see `consat.robots.description.asked`. Nothing is loaded for a team of points."""
+    """The robots of a run; see `consat.robots.description.asked`. None for a team of points, without an import of `consat.robots`."""
     if robots is None and obstacles is None and scenario.robots is None:
         return None
     from consat.robots.description import asked
@@ -46,7 +46,7 @@ def robots_of(robots: Any, obstacles: Any, scenario: Scenario) -> Robots | None:
 
 
 def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
-    """What `run` was given, as a scenario."""
+    """The argument `team` of `run` as a scenario. Its text is empty if no file can hold the team."""
     if isinstance(team, Scenario):
         return team
     if not isinstance(team, Team):
@@ -59,19 +59,19 @@ def scenario_of(team: Team | Scenario | str | os.PathLike[str]) -> Scenario:
 
 
 def with_auxiliary(scenario: Scenario, radius: float) -> Scenario:
-    """The scenario with the auxiliary constraint added to every agent."""
+    """Copy of the scenario with the auxiliary constraint, of this radius, added to every agent."""
     from consat.certify import assumptions
 
     return dataclasses.replace(scenario, team=assumptions.with_auxiliary(scenario.team, radius))
 
 
 def default_protocol(team: Team, layout: Layout) -> str:
-    """The protocol of a team for which nobody names one, see `why_admm`."""
+    """The default protocol of a team; see `why_admm`."""
     return DEFAULT_PROTOCOL if why_admm(team, layout) is None else "admm"
 
 
 def why_admm(team: Team, layout: Layout) -> str | None:
-    """Why admm is the default for a team, where interior-point is not."""
+    """Reason why admm is the default protocol of a team; None if interior-point is."""
     if jax.process_count() > 1:
         return "several processes run the team"
     if team.count > MANY:
@@ -84,16 +84,16 @@ def why_admm(team: Team, layout: Layout) -> str | None:
 
 
 def named(asked: Settings, given: Options) -> str | None:
-    """The protocol that somebody names, or whose gains are given; None where the structure of the team decides."""
+    """The protocol that is named in the options or the scenario, or whose gains are given; None if the default applies."""
     tuned = "admm" if asked.protocol.penalty is not None or asked.protocol.relaxation is not None else None
     return given.protocol or asked.protocol.kind or tuned
 
 
 def settings_of(asked: Settings, given: Options, team: Team) -> Settings:
-    """What the scenario asks for, and `given` overrides; the default protocol is that whose gains are given, or that of the team.
+    """Resolve the settings: those of the scenario, `asked`, overridden by the options, `given`, with the default protocol filled in.
 
     Raises:
-        InvalidSettings: there is no such protocol.
+        InvalidSettings: unknown protocol.
     """
     start, seed = given.start, given.seed
     estimates = given.estimates or asked.protocol.estimates
@@ -111,19 +111,19 @@ def settings_of(asked: Settings, given: Options, team: Team) -> Settings:
 
 
 def copies_of(team: Team, asked: ProtocolSettings) -> Estimates:
-    """Who holds what, as suits a protocol; that of the team where none is named."""
+    """Layout of the copies for a protocol; for the team's default protocol if none is named."""
     kind = asked.kind or default_protocol(team, asked.estimates)
     return way_of(team, kind, asked.estimates).copies if kind in PAIRED else Estimates.of(team, asked.estimates)
 
 
 def way_of(team: Team, kind: str, layout: Layout) -> Way:
-    """Along what the copies of a team travel with a protocol that speaks to pairs; max-min needs what is exact."""
+    """How copies are exchanged by a protocol that sends one message per pair. `max-min` uses a spanning tree, on which steps are exact."""
     return route_of(team, layout, exact=kind == "max-min")
 
 
 def told(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
-    """Which protocol runs, along what copies travel, and why: of ``run --json`` and ``check --json``. `asked`: whose kind is None
-    where nobody names one."""
+    """The keys ``protocol``, ``route`` and ``why`` of ``run --json`` and ``check --json``. `asked`: protocol settings, whose kind is None
+    for the default protocol."""
     kind = asked.kind or default_protocol(team, asked.estimates)
     why = why_admm(team, asked.estimates) if asked.kind is None else None
     if kind not in PAIRED:
@@ -133,15 +133,15 @@ def told(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
 
 
 class Prepared(NamedTuple):
-    """A team made ready to run.
+    """A team that is ready to run.
 
     Attributes:
         team: the team.
         copies: the layout of estimates.
-        then: the layout to which the team goes over if that does not satisfy it; None if there is none.
-        schedule: of ν.
-        size: the team's natural size.
-        settings: what holds.
+        then: the layout to which the team switches if it is not satisfied in time; None without one.
+        schedule: schedule of ν.
+        size: the team's natural scale.
+        settings: resolved settings.
     """
 
     team: Team
@@ -153,7 +153,7 @@ class Prepared(NamedTuple):
 
     @classmethod
     def of(cls, team: Team, settings: Settings) -> Prepared:
-        """Raises: InvalidTeam: agents that depend on each other cannot reach one another."""
+        """Prepare a team. Raises: InvalidTeam: agents that depend on each other are not connected by links."""
         size = scale(team)
         schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
         kind, layout = str(settings.protocol.kind), settings.protocol.estimates
@@ -163,7 +163,12 @@ class Prepared(NamedTuple):
         return cls(team, way.copies, way.then, schedule, size, settings)
 
     def first(self, start: Start | None = None, drive: Drive | None = None) -> np.ndarray:
-        """(C, d) first estimates, drawn as the settings say, or otherwise; drive: robots, which do not start on top of one another."""
+        """(C, d) random initial estimates.
+
+        Args:
+            start: box and seed; those of the settings if None.
+            drive: the robots, whose starts must not overlap; None for points.
+        """
         first = first_estimates(self.team, self.copies, start or self.settings.start, self.size)
         return first if drive is None else apart_from_all(self.team, self.copies, first, drive, (start or self.settings.start).seed)
 
@@ -173,17 +178,17 @@ class Prepared(NamedTuple):
         return bool(shape_of(self.team).concave.all())
 
     def hopeless(self, position: np.ndarray) -> bool:
-        """Whether (N, d) positions prove that no formation satisfies every constraint."""
+        """Whether the positions, (N, d), prove that no formation satisfies every constraint at the end of the schedules."""
         return bounds(self.at_the_end, position, self.schedule.final).verdict == "infeasible"
 
     @property
     def at_the_end(self) -> Team:
-        """The team once its schedules have ended."""
+        """The team after the end of its schedules."""
         return self.team.at(float(self.team.knots.max(initial=0.0)))
 
     @property
     def enough(self) -> Callable[[np.ndarray], bool] | None:
-        """Says of (N, d) positions whether no formation is better by more than a tolerance; None where nobody asks."""
+        """Function that tells whether positions, (N, d), are within `SHARP` of the best margin; None for protocols other than max-min."""
         return (
             (lambda position: _gap(self.at_the_end, position) <= SHARP * self.size.psi)
             if self.settings.protocol.kind == "max-min"
@@ -192,15 +197,22 @@ class Prepared(NamedTuple):
 
 
 TURNS = 2000
-"""So often a start is drawn anew before it is said that there is no room."""
+"""Number of random tries for the start of a robot before an error is raised."""
 
 
 def apart_from_all(team: Team, copies: Estimates, first: np.ndarray, drive: Drive, seed: int) -> np.ndarray:
-    """First estimates, (C, d), in which robots whose start nobody gave do not overlap others or obstacles.
+    """(C, d) initial estimates in which robots without a given start do not overlap other robots or obstacles.
+
+    Args:
+        team: the team.
+        copies: the layout of estimates.
+        first: (C, d) initial estimates.
+        drive: the robots.
+        seed: random seed of new starts.
 
     Raises:
-        InvalidTeam: starts that are given overlap.
-        InvalidSettings: there is no room for all in the box.
+        InvalidTeam: given starts overlap.
+        InvalidSettings: no free start was found for a robot.
     """
     from consat.robots import start_faults
 
@@ -224,13 +236,19 @@ def apart_from_all(team: Team, copies: Estimates, first: np.ndarray, drive: Driv
 
 
 def _gap(team: Team, position: np.ndarray) -> float:
-    """How much better than this, at most, another formation could be."""
+    """Upper bound on the improvement of the margin by another formation; +∞ without a proven bound."""
     certificate = bounds(team, position)
     return np.inf if certificate.upper is None else certificate.upper - certificate.lower
 
 
 def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) -> np.ndarray:
-    """(C, d) first estimates, drawn where nothing is given; the row of each agent's own position is its start (paper, section IV-E).
+    """(C, d) random initial estimates. The row of each agent's own position is its start, where one is given (paper, section IV-E).
+
+    Args:
+        team: the team.
+        copies: the layout of estimates.
+        start: box and seed.
+        size: the team's natural scale, for the default box.
 
     Raises:
         InvalidSettings: the box has another dimension than the team.
@@ -247,7 +265,7 @@ def first_estimates(team: Team, copies: Estimates, start: Start, size: Scale) ->
     random = np.random.default_rng(start.seed)
     where = (team.count, d), (copies.count, d)
     drawn, first = (random.uniform(low, high, shape) for shape in where)
-    if team.around is not None:  # what the box gives, moved into the box that each has of its own
+    if team.around is not None:  # map samples of the common box into each agent's own box
         place, reach = team.around
         half = np.where(high > low, (high - low) / 2, 1.0)
         for values, whose in ((drawn, slice(None)), (first, copies.position)):

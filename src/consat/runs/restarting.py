@@ -1,4 +1,4 @@
-"""Runs of one team from many starts as one computation, and the best of them."""
+"""Restarts: runs of one team from many starts as one vectorised computation, and the choice of the best."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from consat.settings import Settings, Start
 
 
 def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
-    """What runs of one team in rounds share, for `consat.engine.batch`.
+    """Settings that runs of one team share, for `consat.engine.batch`.
 
     Args:
         ready: the team and its settings.
-        weather: of every run; each has a seed of its own.
-        options: how long they go on.
+        weather: message loss and sleep; every run has its own seed.
+        options: options that determine the stop rules.
     """
     asked, nu = ready.settings.protocol, ready.schedule.final
     protocol = ROUNDS[str(asked.kind)]()
@@ -51,16 +51,16 @@ def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
 
 @float64
 def best_start(team: Team, settings: Settings, options: Options) -> dict[str, Any]:
-    """The start from which a team ends with the largest margin: what it finds is found, not proven.
+    """Find the start from which a team ends with the largest margin. The result is not proven to be the best.
 
     Args:
         team: the team.
-        settings: what holds; their seed is the first.
-        options: how long runs go on, what gets lost, and from how many seeds, one after the other, they start.
+        settings: resolved settings; their seed is the first one.
+        options: options that determine stop rules, loss, sleep, and the number of consecutive seeds.
 
     Returns:
-        ``restarts`` of ``consat run --json``: how many, the best seed (of equals the first), how many satisfied every constraint, and the
-        last margin from each seed, null where it is no finite number.
+        The entry ``restarts`` of ``consat run --json``: number of seeds, best seed (the first of equals), number of runs that satisfied
+        every constraint, and the last margin of each run, null where it is not finite.
     """
     ready, start = Prepared.of(team, settings), settings.start
     count, weather = options.restarts, Weather(options.loss, options.sleep)

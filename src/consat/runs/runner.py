@@ -1,4 +1,4 @@
-"""`run`: from a team or a scenario to a result."""
+"""`run` and `resume`: simulate a team or a scenario and return the result."""
 
 from __future__ import annotations
 
@@ -64,48 +64,51 @@ def run(
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Result:
-    """Let a team find, together, a formation in which every constraint holds.
+    """Simulate a team that searches, by a distributed protocol, for a formation in which every constraint holds.
 
     Args:
         team: a `consat.Team`, or a scenario: the path of a file, or the name of a packaged one such as ``case-b``.
-        protocol: how they talk; one of `consat.protocols.ROUNDS` (``admm`` by default) or `consat.protocols.FLOWS`.
-        estimates: ``local``: each holds only the positions its constraints need; ``full``: all of its cluster (the paper).
-        seed: of the random starts and first estimates, and of what gets lost.
-        start: ``(low, high)`` of the box they are drawn from, numbers or (d,) arrays, length.
+        protocol: a key of `consat.protocols.ROUNDS` (discrete rounds) or `consat.protocols.FLOWS` (continuous time). The default is
+            ``interior-point``, or ``admm`` for teams described at `consat.runs.preparation.why_admm`.
+        estimates: ``local``: each agent holds copies of only the positions that its constraints need; ``full``: of all positions of its
+            cluster, as in the paper.
+        seed: random seed of starts, initial estimates and message loss.
+        start: ``(low, high)`` of the box from which starts are drawn, numbers or (d,) arrays, length.
         smoothing: ν_α and ν_β, or ``auto``.
-        until: end of the run, s, in rounds together with `rate`; implies ``stop="never"``.
-        rounds: number of rounds; implies ``stop="never"``.
-        stop: ``satisfied`` (default), ``converged`` or ``never``.
-        loss: probability that a message is lost, in rounds.
-        sleep: probability that an agent skips a round.
-        burst: ``(p, q)``: a link, each direction by itself, turns bad with probability p a round and good again with probability q; while
-            it is bad nothing gets through. In rounds.
-        rate: rounds a second, Hz; by default `consat.runs.options.RATE` where constraints move with time, else rounds take no time.
-        speed: the most that a body moves, length/s; positions then follow estimates. Without, bodies are where their agents want to be.
-        robots: what bodies are, such as ``consat.Unicycle(radius=0.1)``: a model for all, a mapping from ids to models, or the name of a
-            kind; by default those of the scenario.
-        obstacles: what `consat.disc` and its like return, which robots keep clear of; by default those of the scenario.
+        until: end of the run, s; for protocols in rounds only together with `rate`. Implies ``stop="never"``.
+        rounds: number of rounds. Implies ``stop="never"``.
+        stop: ``satisfied``, ``converged`` or ``never``; by default ``satisfied``, and ``converged`` for ``max-min``.
+        loss: probability that a message is lost; for rounds.
+        sleep: probability that an agent skips a round; for rounds.
+        burst: ``(p, q)``, losses in bursts: each direction of a link turns bad with probability p per round, and good again with
+            probability q. A bad link delivers no message. For rounds.
+        rate: rounds per second, Hz. By default `consat.runs.options.RATE` where constraints move with time or robots drive; else rounds
+            take no time.
+        speed: largest speed of a body, length/s; positions then follow estimates. If None, bodies are at their agents' estimates.
+        robots: model of the bodies, such as ``consat.Unicycle(radius=0.1)``: one model for all, a mapping from ids to models, or the name
+            of a kind; by default that of the scenario.
+        obstacles: obstacles that robots avoid, as returned by `consat.disc` and similar functions; by default those of the scenario.
         wind: (d,) velocity of the air, m/s, for robots.
-        noise: the most that a robot's measured position is wrong by, m.
-        auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
-        restarts: runs from so many starts, of this seed and those after it, as one computation, and tells of the one that ends with the
-            largest margin. In rounds only.
-        record: whether to keep all estimates and integral states; by default while they are few.
-        agents: of whom to record anything: ids, ``all`` or ``none``; by default all, of more than 10,000 a sample of 1,000.
-        every: each how manieth round, or sample of a flow, to record.
-        out: a directory, for a result file ``result.nc`` that grows as the run goes on; by default the record is held in memory.
-        checkpoint: seconds between two checkpoints in `out`, from which `resume` goes on; none if None.
+        noise: largest error of a robot's measured position, m.
+        auxiliary: radius, length, of a constraint that is added to every agent: to stay within it of the team's centre (paper, remark 2).
+        restarts: number of starts, with `seed` and the seeds after it, which run as one computation. The result is that of the start whose
+            run ends with the largest margin. For rounds.
+        record: whether to record all estimates and integral states; by default only while they are few.
+        agents: agents to record: ids, ``all`` or ``none``; by default all, but a sample of 1,000 of teams above 10,000.
+        every: record one round, or one sample of a flow, in `every`.
+        out: directory for the result file ``result.nc``, which grows during the run; by default the record is held in memory.
+        checkpoint: seconds between two checkpoints in `out`, from which `resume` continues; no checkpoints if None.
         force: whether to overwrite results of another scenario in `out`.
-        full: whether to list every agent in the summary, however many.
+        full: whether to list every agent in the summary, also for large teams.
         progress: called with the fraction done and the margin.
 
     Returns:
-        the result; divergence, time-out and infeasibility are told by its status and verdict.
+        The result. Divergence, time-out and infeasibility do not raise; see its status and verdict.
 
     Raises:
-        InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
+        InvalidTeam: agents that depend on each other are not connected by links (Assumption 1).
         InvalidScenario: the scenario has faults.
-        InvalidSettings: the settings do not fit together, or `out` cannot be written to or holds results of another scenario.
+        InvalidSettings: the settings do not fit together, or `out` is not writable or holds results of another scenario.
     """
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
@@ -133,19 +136,19 @@ def resume(
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Result:
-    """Go on, bit for bit, where a run with `checkpoint` was interrupted, by whatever.
+    """Continue an interrupted run from its last checkpoint. The result is bit for bit that of an uninterrupted run.
 
     Args:
-        out: the directory of that run.
-        team: the same team, if it holds functions that no file can hold.
-        rounds: end after so many instead, counted from the start.
-        until: end of a flow instead, s.
+        out: directory of the interrupted run.
+        team: the same team; needed only if it holds functions that no file can store.
+        rounds: new number of rounds, counted from the start; as before if None.
+        until: new end time, s; as before if None.
         checkpoint: seconds between two checkpoints; as before if None.
         full: see `run`.
         progress: see `run`.
 
     Raises:
-        InvalidResult: there is no checkpoint, it cannot be read, or it is of another problem.
+        InvalidResult: there is no checkpoint, it is not readable, or it belongs to another problem.
     """
     files = Files(Path(out), checkpoint, checkpoints.read(Path(out) / checkpoints.NAME))
     about = files.about
@@ -158,7 +161,7 @@ def resume(
 
 
 def _start(scenario: Scenario, options: Options, files: Files | None, full: bool, progress: Callable[[float, float], None]) -> Result:
-    """Check the settings, and run."""
+    """Resolve and check the settings, then run."""
     about = {"scenario": scenario.text, "scenario_name": scenario.name, "name": scenario.source, "given": options.data}
     if options.auxiliary is not None:
         scenario = with_auxiliary(scenario, options.auxiliary)
@@ -182,7 +185,7 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
 
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
-    """What several processes can do."""
+    """Check that several processes can run the team. Raises: InvalidSettings: they cannot."""
     if options.restarts > 1 or options.robots is not None or options.burst is not None:
         raise InvalidSettings("several processes run points, from one start, and lose messages one by one; use one process for more")
     if kind in FLOWS or checkpoints:
@@ -193,16 +196,16 @@ def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) 
 
 @dataclasses.dataclass(frozen=True)
 class _Keep:
-    """What is kept of a run, and where; `about` is what `resume` must know."""
+    """Recording of a run: options, output files, and `about`, the metadata that `resume` needs."""
 
     asked: Options
     files: Files | None
     about: Mapping[str, Any]
 
     def options(self, team: Team, copies: Estimates, clock: str) -> dict[str, Any]:
-        """Arguments of `simulate_rounds` and `simulate_flow`."""
+        """Keyword arguments of `simulate_rounds` and `simulate_flow` for recording."""
         choice = Choice.of(team, copies, self.asked.agents, self.asked.record, self.asked.every)
-        if self.files is None or jax.process_index() > 0:  # process 0 writes for all
+        if self.files is None or jax.process_index() > 0:  # only process 0 writes
             return {"choice": choice}
         sink = self.files.sink(team, copies, choice, clock, heading=self.asked.robots is not None)
         return {"choice": choice, "sink": sink, "checkpoint": self.files.checkpoints(self.about)}

@@ -1,7 +1,7 @@
-"""A team that lives while the world moves: stepped as one likes, and changed between two rounds.
+"""`Session`: a team that is advanced round by round, and can be changed between two rounds.
 
-Parameters of constraints are arguments of the compiled rounds, so a changed one compiles nothing. Agents, constraints and links may come
-and go: then rounds are compiled once more, and everybody goes on with what they remember.
+Constraint parameters are arguments of the compiled rounds, so that a change of a parameter does not compile. Adding or removing agents,
+constraints or links compiles the rounds again; the agents keep their state.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ from consat.scenario import Scenario
 from consat.settings import Smoothing
 
 PLACES = frozenset(("center", "vector", "radius", "low", "high"))
-"""Parameters that are lengths: where they are small, a constraint asks nobody to go far."""
+"""Parameters that are lengths: while they are small, a constraint does not ask an agent to move beyond the team's region."""
 
 
 class Assessment(NamedTuple):
-    """What an observer of the whole team can say of it as it is now.
+    """Certificate by an observer of the whole team, for the present constraints.
 
     Attributes:
         verdict: ``feasible``, ``infeasible`` or ``undecided``; proven.
-        bounds: (lower, upper) on the best margin that any formation has; None where nothing is proven.
-        reasons: what limits the team, who conflicts, and what would do, in words.
-        positions: (N, d) a formation of margin ``bounds[0]``.
+        bounds: (lower, upper) bounds on the best margin of any formation; None where there is no bound.
+        reasons: sentences about what limits the team, which constraints conflict, and what would help.
+        positions: (N, d) a formation with margin ``bounds[0]``.
     """
 
     verdict: Verdict
@@ -66,12 +66,12 @@ class Assessment(NamedTuple):
 
 
 class _Engine(NamedTuple):
-    """What is compiled for one structure of the team.
+    """Engine for one structure of the team.
 
     Attributes:
-        ready: the team when it was built.
-        carrier: who carries out the rounds.
-        live: the parameters, as arrays that are written to.
+        ready: the prepared team when the engine was built.
+        carrier: engine that computes the rounds.
+        live: constraint parameters, as NumPy arrays that are modified in place.
     """
 
     ready: Prepared
@@ -80,27 +80,27 @@ class _Engine(NamedTuple):
 
 
 class Session:
-    """A team that is stepped, and changed in between.
+    """A team that is advanced by rounds and can be changed between them.
 
     Args:
         team: a `consat.Team` or a scenario, as in `consat.run`.
-        protocol: one in rounds; as in `consat.run`.
+        protocol: a protocol in rounds; as in `consat.run`.
         estimates: as in `consat.run`.
-        seed: of starts that are drawn, and of what gets lost.
-        start: ``(low, high)`` of the box they are drawn from, length.
+        seed: random seed of starts and message loss.
+        start: ``(low, high)`` of the box from which starts are drawn, length.
         smoothing: as in `consat.run`.
         loss: probability that a message is lost.
         sleep: probability that an agent skips a round.
-        burst: of losses in bursts, as in `consat.run`.
-        rate: rounds a second, Hz; what schedules, robots and `time` go by. By default that of the scenario, or 20.
-        speed: the most that a body moves, length/s; None if bodies are where their agents want to be.
-        robots: what bodies are, as in `consat.run`; a robot that joins later is like the first, if nobody says.
-        obstacles: what robots keep clear of, as in `consat.run`.
+        burst: losses in bursts, as in `consat.run`.
+        rate: rounds per second, Hz, for schedules, robots and `time`. By default that of the scenario, or 20.
+        speed: largest speed of a body, length/s; if None, bodies are at their agents' estimates.
+        robots: model of the bodies, as in `consat.run`. A robot that joins later has the model of the first by default.
+        obstacles: obstacles that robots avoid, as in `consat.run`.
         wind: as in `consat.run`.
         noise: as in `consat.run`.
 
     Raises:
-        InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
+        InvalidTeam: agents that depend on each other are not connected by links (Assumption 1).
         InvalidScenario: the scenario has faults.
         InvalidSettings: the settings do not fit together.
     """
@@ -142,10 +142,13 @@ class Session:
 
     @float64
     def step(self, rounds: int = 1) -> Self:
-        """Let so many rounds pass.
+        """Advance by a number of rounds.
 
         Args:
-            rounds: how many, at least 0.
+            rounds: number of rounds, at least 0.
+
+        Raises:
+            InvalidSettings: `rounds` is not a whole number from 0.
         """
         if isinstance(rounds, bool) or not isinstance(rounds, int | np.integer) or rounds < 0:
             raise InvalidSettings(f"rounds is {rounds!r}, but must be a whole number from 0")
@@ -172,27 +175,27 @@ class Session:
 
     @property
     def round(self) -> int:
-        """Rounds so far."""
+        """Number of rounds so far."""
         return self._tally.done
 
     @property
     def protocol(self) -> str:
-        """Its kind, such as ``interior-point``."""
+        """Name of the protocol, such as ``interior-point``."""
         return self._kind
 
     @property
     def rate(self) -> float:
-        """Rounds a second, Hz."""
+        """Rounds per second, Hz."""
         return self._body.rate
 
     @property
     def time(self) -> float:
-        """s since the start, at `rate` rounds a second."""
+        """Time since the start, s: `round` / `rate`."""
         return self._tally.done / self._body.rate
 
     @property
     def positions(self) -> np.ndarray:
-        """(N, d) where the agents are, in the order of ``session.team.ids``."""
+        """(N, d) positions of the bodies, in the order of ``session.team.ids``."""
         return np.array(self._positions)
 
     @property
@@ -203,13 +206,13 @@ class Session:
     @property
     @float64
     def headings(self) -> np.ndarray | None:
-        """(N,) which way robots look, rad; None where bodies are points."""
+        """(N,) headings of the robots, rad; None where bodies are points."""
         drive, robots = self._body.drive, self._state.robots
         return None if drive is None or robots is None else np.array(drive.model.heading(robots.state))
 
     @property
     def margin(self) -> float:
-        """The least of them: positive where every constraint of everybody holds."""
+        """The smallest of `margins`: positive if every constraint of every agent holds."""
         return float(self._margins.min(initial=np.inf))
 
     @property
@@ -219,23 +222,23 @@ class Session:
 
     @property
     def known(self) -> str | None:
-        """What every agent knows by itself: ``satisfied``, ``infeasible`` or nothing."""
+        """What every agent knows by itself about the team: ``satisfied``, ``infeasible`` or None."""
         return known_of(self._tally)
 
     # ---- changing -----------------------------------------------------------------------------------------------------------------------
 
     @float64
     def change(self, agent: str, constraint: str, **parameters: Any) -> Self:
-        """Change parameters of a constraint; the next round uses them. Nothing compiles and nothing restarts, unless a parameter begins or
-        ceases to be a schedule.
+        """Change parameters of a constraint from the next round on. This does not compile, unless a parameter becomes a schedule or stops
+        being one, or the curvature of a user-defined constraint changes.
 
         Args:
-            agent: whose it is.
-            constraint: its name.
-            parameters: such as ``center=[3, 1]`` or ``radius=2``; ``weight`` too.
+            agent: owner of the constraint.
+            constraint: name of the constraint.
+            parameters: new values, such as ``center=[3, 1]`` or ``radius=2``; also ``weight``.
 
         Raises:
-            InvalidTeam: no such agent, constraint or parameter, or a value that it cannot have; the session is as it was.
+            InvalidTeam: unknown agent, constraint or parameter, or an invalid value; the session is unchanged.
         """
         if not parameters:
             return self
@@ -255,14 +258,14 @@ class Session:
 
     @float64
     def place(self, agent: str, position: ArrayLike) -> Self:
-        """Put an agent's body somewhere else: it was pushed, or measured there.
+        """Set the position of an agent's body, for example after it was pushed or measured.
 
         Args:
-            agent: who.
-            position: (d,), length.
+            agent: id of the agent.
+            position: (d,) new position, length.
 
         Raises:
-            InvalidTeam: no such agent, or no position; the session is as it was.
+            InvalidTeam: unknown agent, or not a position; the session is unchanged.
         """
         i = self._place_of(agent)
         faults: list[Fault] = []
@@ -276,14 +279,14 @@ class Session:
 
     @float64
     def add(self, agent: Agent, links: Iterable[str] | None = None) -> Self:
-        """Let an agent join.
+        """Add an agent.
 
         Args:
-            agent: with its constraints, and where it is; at the middle of those it is linked to if it does not say.
-            links: ids of those it can talk to; by default those whose positions its constraints read.
+            agent: the agent with its constraints. Without a start it starts at the mean position of the agents that it is linked to.
+            links: ids of the agents to link it to; by default those whose positions its constraints read.
 
         Raises:
-            InvalidTeam: it does not fit the team; the session is as it was.
+            InvalidTeam: the agent does not fit the team; the session is unchanged.
         """
         team = self.team
         known = set(team.ids)
@@ -306,10 +309,10 @@ class Session:
 
     @float64
     def remove(self, agent: str) -> Self:
-        """Let an agent go, with its constraints, its links, and the constraints that read its position.
+        """Remove an agent, its constraints, its links, and all constraints that read its position.
 
         Raises:
-            InvalidTeam: no such agent, the last one, or those that stay could not reach one another; the session is as it was.
+            InvalidTeam: unknown agent, the last agent, or the remaining agents would not be connected; the session is unchanged.
         """
         i, team = self._place_of(agent), self.team
         if team.count == 1:
@@ -322,10 +325,10 @@ class Session:
 
     @float64
     def connect(self, one: str, other: str) -> Self:
-        """Let two agents talk to each other.
+        """Add a link between two agents.
 
         Raises:
-            InvalidTeam: no such agents, or they can already; the session is as it was.
+            InvalidTeam: unknown agents, or the link exists; the session is unchanged.
         """
         pair, team = self._pair(one, other), self.team
         if self._linked(team, pair):
@@ -336,10 +339,10 @@ class Session:
 
     @float64
     def disconnect(self, one: str, other: str) -> Self:
-        """Cut a link.
+        """Remove the link between two agents.
 
         Raises:
-            InvalidTeam: there is none, or agents that depend on each other could not reach one another without; the session is as it was.
+            InvalidTeam: no such link, or agents that depend on each other would not be connected without it; the session is unchanged.
         """
         pair, team = self._pair(one, other), self.team
         if not self._linked(team, pair):
@@ -351,14 +354,15 @@ class Session:
 
     @float64
     def add_constraint(self, agent: str, constraint: Any) -> Self:
-        """Give an agent one more constraint.
+        """Add a constraint to an agent.
 
         Args:
-            agent: whose it is.
-            constraint: what `consat.within` and its like return.
+            agent: id of the owner.
+            constraint: a constraint, as returned by `consat.within` and similar functions.
 
         Raises:
-            InvalidTeam: it does not fit the team, or reads somebody out of reach; the session is as it was.
+            InvalidTeam: the constraint does not fit the team, or reads an agent that is not connected to the owner; the session is
+                unchanged.
         """
         i, team = self._place_of(agent), self.team
         agents = list(team.agents)
@@ -368,10 +372,10 @@ class Session:
 
     @float64
     def remove_constraint(self, agent: str, constraint: str) -> Self:
-        """Take a constraint from an agent.
+        """Remove a constraint of an agent, given by its name.
 
         Raises:
-            InvalidTeam: there is none of this name; the session is as it was.
+            InvalidTeam: unknown agent or constraint; the session is unchanged.
         """
         team, i = self.team, self._place_of(agent)
         numbers = named(team, agent, constraint)
@@ -383,14 +387,13 @@ class Session:
 
     @float64
     def become(self, team: Team) -> Self:
-        """Go on with another team; agents of ids that were in it stay where they are, and keep what they remember.
+        """Replace the team. Agents whose ids were in the old team keep their positions and states.
 
         Args:
-            team: of the same dimension.
+            team: the new team, of the same dimension.
 
         Raises:
-            InvalidTeam: its dimension is another, or agents that depend on each other could not reach one another; the session is as it
-                was.
+            InvalidTeam: another dimension, or agents that depend on each other are not connected; the session is unchanged.
         """
         if team.dimension != self.dimension:
             raise InvalidTeam([Fault(("dimension",), f"dimension is {team.dimension}, but must stay {self.dimension}", "dimension")])
@@ -400,10 +403,13 @@ class Session:
 
     @float64
     def lose(self, share: float) -> Self:
-        """Lose this share of the messages from now on; it compiles once more.
+        """Set the probability that a message is lost. The rounds are compiled again.
+
+        Args:
+            share: probability in [0, 1).
 
         Raises:
-            InvalidSettings: it is no probability below 1.
+            InvalidSettings: `share` is out of range.
         """
         options = dataclasses.replace(self._options, loss=share)
         self._weather = options.weather(self._weather.seed)
@@ -415,12 +421,12 @@ class Session:
 
     @property
     def dimension(self) -> int:
-        """d."""
+        """d, the dimension of the space."""
         return self._engine.ready.team.dimension
 
     @property
     def team(self) -> Team:
-        """The team as it is now: its constraints with the parameters that are in force. What moves with time keeps its schedule."""
+        """The team with the present parameters of its constraints. Parameters that move with time keep their schedules."""
         team = self._engine.ready.team
         families = [
             dataclasses.replace(family, parameters={key: np.array(value) for key, value in own.items()})
@@ -430,12 +436,12 @@ class Session:
 
     @float64
     def assess(self) -> Assessment:
-        """What an observer can prove of the team as it is now, centrally."""
+        """Certify the team centrally, with the constraints at the present time."""
         return assessed(self.team.at(self.time))
 
     @float64
     def result(self) -> Result:
-        """What has been recorded so far, as of any other run; agents that have left are not in it."""
+        """Result of the rounds so far, as of `consat.run`. Agents that were removed are not in it."""
         ready, tally = self._engine.ready, self._tally
         rows = self._record.close()
         if not len(rows.step) or rows.step[-1] != tally.done:
@@ -464,7 +470,7 @@ class Session:
     # ---- inside -------------------------------------------------------------------------------------------------------------------------
 
     def _body_of(self, team: Team) -> Body:
-        """What bodies are, for a team."""
+        """Motion of the bodies of a team."""
         body = self._options.pace(self._kind, team).body
         assert body is not None, "a session has a rate"
         return body
@@ -483,10 +489,10 @@ class Session:
         return _Engine(ready, carrier, live)
 
     def _restructure(self, team: Team) -> None:
-        """Go on with another structure; what everybody remembers of what stays is carried over. Nothing happens where that cannot be."""
+        """Build an engine for a team of another structure, and transfer the state. If an error is raised, the session is unchanged."""
         old = self._engine
         copies = copies_of(team, old.ready.settings.protocol)
-        now, size = scale(team), old.ready.size  # units stay, but proofs speak of wherever the team may now lead
+        now, size = scale(team), old.ready.size  # units stay the same, but the region of proofs must cover the new constraints
         extent = now.extent + now.reach + float(np.linalg.norm(np.asarray(now.center) - np.asarray(size.center)))
         ready = old.ready._replace(team=team, copies=copies, size=size._replace(extent=max(size.extent, extent)))
         kind = str(ready.settings.protocol.kind)
@@ -501,14 +507,14 @@ class Session:
             robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
         state = state._replace(state=_begun_anew(inner), body=on_device(place), key=self._state.key, robots=robots)
         margins = np.asarray(_margins(engine.carrier.world, state, float(self.round)))
-        # from here on nothing can fail
+        # the session is modified only below, where no error can be raised
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
         self._engine, self._state, self._positions, self._margins, self._body = engine, state, place, margins, body
         self._extent = max(self._extent, ready.size.extent / ready.size.length)
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
-        """(C, d) estimates to begin with: of new copies where their owner is, and (N, d) bodies."""
+        """(C, d) initial estimates, each at the position of its owner's body, and (N, d) positions of bodies."""
         team, copies = ready.team, ready.copies
         place = {agent: k for k, agent in enumerate(self._engine.ready.team.ids)}
         drawn = ready.first()
@@ -541,7 +547,7 @@ class Session:
             raise InvalidTeam([dataclasses.replace(fault, where=without) for fault in error.faults]) from None
 
     def _bends_otherwise(self, team: Team) -> bool:
-        """Whether what was compiled of the curvature of constraints does not hold of a team with other parameters."""
+        """Whether the compiled curvature of a user-defined constraint is not valid for a team with other parameters."""
         before = self._engine.ready.team
         return any(
             form_of(old, team.dimension) != form_of(new, team.dimension)
@@ -550,50 +556,50 @@ class Session:
         )
 
     def _reach_out(self, change: Change) -> None:
-        """See that proofs speak of wherever a changed constraint may lead."""
+        """Enlarge the region of proofs, if needed, so that it covers a changed constraint."""
         size, carrier = self._engine.ready.size, self._engine.carrier
         family = self._engine.ready.team.families[change.family]
         if carrier.world.everyone.interior is None or family.psi not in ADJUSTABLE:
             return
         if PLACES.issuperset(change.given) and all(np.abs(np.asarray(value)).max() <= self._well_inside for value in change.given.values()):
-            return  # what most changes are
+            return  # the most frequent case
         own = {key: np.asarray(array)[[change.member]] for key, array in self._engine.live.parameters[change.family].items()}
         asked = farthest(family.psi, own, np.asarray(size.center)) / size.length
         if asked <= self._extent:
             return
-        self._extent = asked if family.arity == 1 else self._extent + asked  # apart from a teammate, who may be as far out as that
+        self._extent = asked if family.arity == 1 else self._extent + asked  # relative to another agent, which may itself be that far out
         everyone, interior = carrier.world.everyone, carrier.world.everyone.interior
         interior = dataclasses.replace(interior, units=interior.units._replace(extent=on_device(self._extent)))
         carrier.world = dataclasses.replace(carrier.world, everyone=dataclasses.replace(everyone, interior=interior))
 
     def _note_changes(self, owners: Iterable[int]) -> None:
-        """Those whose constraints have changed tell everybody that proofs begin anew."""
+        """Raise the count of changes of the agents whose constraints have changed, and drop their bounds, so that all proofs restart."""
         inner = self._state.state
         if not isinstance(inner, InteriorState):
             return
         changes, bound = np.array(inner.memory.changes), np.array(inner.memory.bound)
         changes[list(owners)] += 1.0
         bound[list(owners)] = np.inf
-        # as numpy's arrays: the next round takes them along for nothing, where to put them on the device takes a sixth of a small round
+        # NumPy arrays are transferred with the next call; a separate transfer to the device takes a sixth of a small round
         memory = inner.memory._replace(changes=changes, bound=bound)  # type: ignore[arg-type]
         self._state = self._state._replace(state=inner._replace(memory=memory))
 
 
 @float64
 def assessed(team: Team) -> Assessment:
-    """What an observer can prove of a team whose constraints stand still, centrally."""
+    """Certify a team with constant constraints centrally."""
     best, found = judged(team)
     lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
     return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
 
 
 def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:
-    """A team with other agents, and with more links."""
+    """Team with the agents `agents` and additional links, other properties as in `team`."""
     return Team(agents, [*team.linked, *links], team.dimension, unit=team.unit)
 
 
 def _begun_anew(state: Any) -> Any:
-    """The state of a team of another structure: what was proven is so no more."""
+    """State for a team of another structure: raises the count of changes and drops all bounds, which are not valid any more."""
     if not isinstance(state, InteriorState):
         return state
     memory = state.memory
@@ -607,7 +613,7 @@ def _body_moved(body: Any, x: Any, row: Any, i: Any, value: Any) -> tuple[Any, A
 
 
 def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> Now:
-    """With a body somewhere else; own: whether the agent's estimate of its own position goes with it."""
+    """Copy of the state with the body of agent `i` at `value`, (d,). `own`: whether the agent's own estimate is set, too."""
     row = world.own[i]
     body, x = _body_moved(now.body, now.state.x, row, on_device(i), on_device(value))
     state = now.state
@@ -629,7 +635,13 @@ def _margins(world: World, now: Now, round_: Any) -> Any:
 
 
 def _renamed(record: Memory, before: Sequence[str], after: Sequence[str]) -> Memory:
-    """A record with the rows of other agents; those who were not there yet are nowhere."""
+    """Copy of a record for other agents. Positions and margins of agents that were not in it are NaN.
+
+    Args:
+        record: the record.
+        before: ids of its agents.
+        after: ids of the new agents.
+    """
     rows, place = record.close(), {agent: k for k, agent in enumerate(before)}
     where = np.array([place.get(agent, -1) for agent in after])
     there = where >= 0

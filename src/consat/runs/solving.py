@@ -1,4 +1,4 @@
-"""`solve`: the best margin, found centrally."""
+"""`solve`: compute the best margin of a team centrally."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from consat.scenario import Scenario
 
 SCHEMA = "consat.solve/1"
 PROVEN = 1e-6
-"""A margin that is proven to be so near the best possible, in the team's unit of ψ, is the best possible."""
+"""Largest gap between margin and proven bound, in the team's unit of ψ, at which the margin counts as the best possible."""
 
 
 class Solution(dict[str, Any]):
-    """What ``consat solve --json`` prints (schema consat.solve/1), with its main entries as attributes.
+    """The document that ``consat solve --json`` prints (schema consat.solve/1), with its main entries as attributes.
 
     Attributes:
-        team: that was solved; None if it is not known.
+        team: the team that was solved; None if unknown.
     """
 
     team: Team | None = None
 
     @property
     def margin(self) -> float | None:
-        """The best margin that was found; None if it is unbounded."""
+        """The best margin found; None if it is unbounded."""
         margin: float | None = self["margin"]
         return margin
 
     @property
     def bounds(self) -> tuple[float | None, float | None]:
-        """Between what the best possible margin lies, proven; None where nothing is."""
+        """Proven lower and upper bounds on the best possible margin; None where there is no bound."""
         lower, upper = self["bounds"]
         return lower, upper
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the constraints can all hold."""
+        """Whether all constraints can hold: ``feasible``, ``infeasible`` or ``undecided``."""
         verdict: Verdict = self["verdict"]
         return verdict
 
     @property
     def positions(self) -> dict[str, list[float | None]]:
-        """Where everybody stands, by id."""
+        """Positions of the agents in the formation found, by id."""
         positions: dict[str, list[float | None]] = self["positions"]
         return positions
 
     @property
     def reasons(self) -> list[str]:
-        """What binds or conflicts, in words."""
+        """Sentences about the binding or conflicting constraints."""
         reasons: list[str] = self["reasons"]
         return reasons
 
@@ -69,16 +69,16 @@ class Solution(dict[str, Any]):
 
 @float64
 def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxiliary: float | None = None) -> Solution:
-    """Find the best margin that any formation can have, centrally, with a certificate; see `consat.certify.optimum.max_min`.
+    """Compute the best margin of any formation centrally, with a certificate; see `consat.certify.optimum.max_min`.
 
     Args:
         team: as in `run`.
-        seed: of the starts, where there are many.
+        seed: random seed of the starts, where the method uses several.
         auxiliary: as in `run`.
 
     Returns:
-        what ``consat solve --json`` prints (schema consat.solve/1): ``proven`` says whether ``bounds`` show that no formation has a better
-        margin, ``reasons`` what binds or conflicts, in words.
+        The document that ``consat solve --json`` prints (schema consat.solve/1). ``proven`` tells whether ``bounds`` prove that no
+        formation has a better margin; ``reasons`` are sentences about the binding or conflicting constraints.
     """
     from consat.certify.optimum import max_min
     from consat.certify.reasons import explain
@@ -113,7 +113,7 @@ def solve(team: Team | Scenario | str | os.PathLike[str], *, seed: int = 0, auxi
 
 
 def _auxiliary(team: Team, radius: float, multipliers: np.ndarray) -> dict[str, Any]:
-    """Says that the auxiliary constraint was added, and on whom it binds: then the radius is too small."""
+    """The entry ``auxiliary`` of the document: the radius, and the agents on which it binds, for which it is too small."""
     from consat.certify.assumptions import binding_auxiliaries
 
     return {"radius": radius, "binding": binding_auxiliaries(team, multipliers, BINDING)}

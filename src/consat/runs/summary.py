@@ -1,4 +1,4 @@
-"""What is told of a run: how it ended, and its numbers, as JSON can hold them."""
+"""Summary of a run, as a JSON document: how it ended, and its measures."""
 
 from __future__ import annotations
 
@@ -22,18 +22,28 @@ from consat.settings import Settings
 
 SCHEMA = "consat.run/1"
 MOST_LISTED = 10_000
-"""Above this many agents the summary leaves out what it says of each."""
+"""Largest number of agents that the summary lists one by one."""
 NEAR = 0.05
-"""A formation whose margin is proven to be within this fraction of the best possible is least violating; …"""
+"""Relative gap to the proven bound up to which a formation counts as least violating."""
 NEARLY = 1e-3
-"""… and so is one within this of it, in ψ, or in the team's unit of ψ where that is less."""
+"""Absolute gap to the proven bound up to which a formation counts as least violating, times the team's unit of ψ or 1, if that is less."""
 
 
 def summarise(
     scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, *, full: bool = False,
     robots: Robots | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """What ``run --json`` prints (schema consat.run/1)."""
+    """The document that ``run --json`` prints (schema consat.run/1).
+
+    Args:
+        scenario: the scenario.
+        settings: resolved settings.
+        schedule: schedule of ν.
+        size: the team's natural scale.
+        trace: trace of the run.
+        full: whether to list every agent, also above `MOST_LISTED` agents.
+        robots: the robots; None for points.
+    """
     whole, position = scenario.team, trace.end
     team = whole.at(float(trace.steps[-1]) * (trace.period or 1.0))
     nu = schedule.final
@@ -81,7 +91,7 @@ def summarise(
 
 
 def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:
-    """What is certified over the time of a run."""
+    """Certified verdicts over the time of a run; see `consat.runs.verdicts`."""
     period = trace.period or 1.0
     recorded = trace.recorded is None and trace.file is None
 
@@ -95,12 +105,12 @@ def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:
 
 
 def status_of(ending: str, margin: float, upper: float | None, psi: float) -> str:
-    """How a run ended; ``least-violating`` is said only where it is proven.
+    """Status of a run. ``least-violating`` is returned only where it is proven.
 
     Args:
-        ending: why the run ended.
-        margin: of the team at the end; not finite where a position is not, +∞ without constraints.
-        upper: proven bound on the best margin that any formation can have, or None.
+        ending: reason why the run ended.
+        margin: margin of the team at the end; not finite where a position is not, +∞ without constraints.
+        upper: proven upper bound on the best margin of any formation; None without one.
         psi: the team's unit of ψ.
     """
     if ending == "diverged":
@@ -124,7 +134,12 @@ def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray, violated: 
 
 
 def _on_the_way(team: Team, violated: np.ndarray) -> Mapping[str, Any]:
-    """Of the constraints that may keep out of something: how many there are, how many were violated at any time, and the worst of them."""
+    """Entry ``on_the_way``: number of watched constraints, number of those that were violated at any time, and the worst of them.
+
+    Args:
+        team: the team.
+        violated: (M,) fraction of the run for which each constraint was violated; NaN where it is not watched.
+    """
     watched, ever = int(np.count_nonzero(~np.isnan(violated))), int(np.count_nonzero(violated > 0))
     worst = None
     if ever:
@@ -141,5 +156,5 @@ def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:
 
 
 def number(value: Any) -> float | None:
-    """A float for JSON, which knows no infinity: null instead."""
+    """A float for JSON; None (null) where it is not finite."""
     return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""`sweep`: many seeds and parameter values, as one computation where the protocol goes in rounds."""
+"""`sweep`: runs with many seeds and parameter values, as one vectorised computation for protocols in rounds."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from consat.settings import Start
 
 SCHEMA = "consat.sweep/1"
 MOST_LISTED = 10_000
-"""Above this many runs the summary leaves them out; the CSV file lists all."""
+"""Largest number of runs that the summary lists; the CSV file always lists all."""
 MOST_VALUES = 1_000_000
-"""In a range; each value is a run."""
+"""Largest number of values in a range."""
 OF_A_RUN = ("loss", "sleep")
-"""Parameters that belong to a run rather than to the scenario."""
+"""Parameters of the run, not of the scenario."""
 MEASURED = ("satisfied_from", "margin", "smooth_margin", "rounds", "messages", "floats_sent")
-"""What is told of each run, and of each value in the mean."""
+"""Quantities reported for each run, and as statistics for each combination of values."""
 
 
 class Sweep:
-    """Many runs.
+    """Result of a sweep.
 
     Attributes:
-        summary: what ``consat sweep --json`` prints.
-        runs: of each run a row: the parameters' values, the seed, and what became of it.
+        summary: the document that ``consat sweep --json`` prints.
+        runs: one row per run: values of the parameters, seed, and result.
     """
 
     def __init__(self, summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> None:
@@ -58,7 +58,7 @@ class Sweep:
         self.runs = list(runs)
 
     def save(self, directory: str | os.PathLike[str]) -> list[Path]:
-        """Write sweep.json, sweep.csv (a line a run) and the figure sweep.png."""
+        """Write sweep.json, sweep.csv (one line per run) and the figure sweep.png. Returns their paths."""
         target = Path(directory)
         target.mkdir(parents=True, exist_ok=True)
         (target / "sweep.json").write_text(json.dumps(self.summary, indent=1))
@@ -69,7 +69,7 @@ class Sweep:
         return [target / "sweep.json", target / "sweep.csv", self.plot(target / "sweep.png")]
 
     def plot(self, path: str | os.PathLike[str]) -> Path:
-        """The figure: rounds to satisfaction, margin and success over the parameter; see `consat.views.spread`."""
+        """Write the figure: rounds to satisfaction, margin and success over the parameter; see `consat.views.spread`. Returns its path."""
         from consat.views import spread
 
         return spread.save(self.summary, self.runs, path)
@@ -86,10 +86,10 @@ class Sweep:
 
 
 def values(text: str) -> list[Any]:
-    """The values that ``v1,v2,…`` or ``a:b:n`` (n numbers from a to b) means; each is YAML, and may hold commas within brackets.
+    """Parse a list of values ``v1,v2,…`` or a range ``a:b:n`` (n numbers from a to b). Each value is YAML; commas may occur in brackets.
 
     Raises:
-        InvalidSettings: a range that is none.
+        InvalidSettings: malformed range.
     """
     from consat.scenario.document import read
 
@@ -115,7 +115,7 @@ def values(text: str) -> list[Any]:
 
 
 class _Combination(NamedTuple):
-    """One choice of the parameters."""
+    """One combination of parameter values, the prepared team, and (loss, sleep)."""
 
     chosen: Mapping[str, Any]
     ready: Prepared
@@ -140,26 +140,30 @@ def sweep(
     full: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Sweep:
-    """Run a scenario with many seeds, and with every combination of some values of its parameters.
+    """Run a scenario with many seeds and every combination of parameter values.
 
-    Protocols in rounds run as one computation, a lane a run, with exactly the rounds that each would take by itself (`consat.run` with the
-    same seed gives the same, to rounding); parameters that change shapes (``count``) make a computation each. Flows run one by one.
+    Protocols in rounds run as one vectorised computation, one run per lane. Every run takes the same rounds as alone: `consat.run` with the
+    same seed gives the same result up to rounding. Parameters that change array shapes (``count``) need one computation for each value.
+    Flows and teams with moving constraints run one after the other.
 
     Args:
-        team: as in `consat.run`; parameters of the scenario can be swept only if there is one.
-        over: dotted paths into the scenario, as for ``--set``, or ``loss`` or ``sleep``, and of each the values to try.
-        seeds: how many, from the scenario's own on; or which.
-        protocol: as in `consat.run`, as is all that follows.
-        estimates: who holds copies.
-        start: the box of starts.
-        rounds: how many.
-        until: end of a flow, s.
-        stop: when to end earlier.
-        loss: probability that a message is lost.
-        sleep: probability that an agent skips a round.
-        auxiliary: radius of the auxiliary constraint.
-        full: whether to list every run in the summary, however many.
-        progress: called with the fraction of runs that have ended, and the share of these that satisfied every constraint.
+        team: as in `consat.run`. Parameters of a scenario can be swept only if `team` is one, or can be written as one.
+        over: parameter to list of values. A parameter is a dotted path into the scenario, as for ``--set``, or ``loss`` or ``sleep``.
+        seeds: number of seeds, counted from the scenario's seed; or a list of seeds.
+        protocol: as in `consat.run`.
+        estimates: as in `consat.run`.
+        start: as in `consat.run`.
+        rounds: as in `consat.run`.
+        until: as in `consat.run`.
+        stop: as in `consat.run`.
+        loss: as in `consat.run`.
+        sleep: as in `consat.run`.
+        auxiliary: as in `consat.run`.
+        full: whether to list every run in the summary, also above `MOST_LISTED` runs.
+        progress: called with the fraction of runs that have ended, and the fraction of these that satisfied every constraint.
+
+    Raises:
+        InvalidSettings: the settings do not fit together, or no values or seeds are given.
     """
     began = time.perf_counter()
     scenario = scenario_of(team)
@@ -200,13 +204,13 @@ def sweep(
 
 @dataclass(frozen=True)
 class _Asked:
-    """What all runs share."""
+    """The scenario and options that all runs share."""
 
     scenario: Scenario
     options: Options
 
     def combinations(self, over: Mapping[str, Sequence[Any]]) -> Iterator[_Combination]:
-        """Every combination of the values, the last path's values changing fastest."""
+        """All combinations of the values; the last parameter changes fastest."""
         of_scenario = [path for path in over if path not in OF_A_RUN]
         if of_scenario and not self.scenario.text:
             raise InvalidSettings(f"{of_scenario[0]} is a path into a scenario, but this team has none that a file could hold")
@@ -234,7 +238,7 @@ class _Asked:
     def together(
         self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]
     ) -> list[dict[str, Any]]:
-        """All runs in rounds: a computation for each shape."""
+        """Run all combinations in rounds, with one computation for each set of array shapes."""
         batches: dict[Any, list[tuple[int, Lane]]] = defaultdict(list)
         protocols = {}
         for k, combination in enumerate(combinations):
@@ -265,7 +269,7 @@ class _Asked:
     def one_by_one(
         self, combinations: Sequence[_Combination], seeds: Sequence[int], progress: Callable[[float, float], None]
     ) -> Iterator[dict[str, Any]]:
-        """All runs, each by itself."""
+        """Run all combinations one after the other."""
         satisfied, total = 0, len(combinations) * len(seeds)
         for k, (combination, seed) in enumerate(itertools.product(combinations, seeds)):
             ready, (loss, sleep) = combination.ready, combination.weather
@@ -290,14 +294,14 @@ class _Asked:
 
 
 def _probability(name: str, value: Any) -> float:
-    """Raises: InvalidSettings: it is none, or 1."""
+    """Check a probability. Raises: InvalidSettings: it is not a number in [0, 1)."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
         raise InvalidSettings(f"{name} is {shown(value)}, but must be a probability below 1, such as 0.3")
     return float(value)
 
 
 def _row(ready: Prepared, outcome: Outcome) -> dict[str, Any]:
-    """What became of one run, in the words of ``run --json``."""
+    """Result of one run, with the keys of ``run --json``."""
     tally, margin = outcome.tally, outcome.tally.margin
     certificate = None if margin > 0 else bounds(ready.team, outcome.positions, ready.schedule.final)
     return {
@@ -314,7 +318,7 @@ def _row(ready: Prepared, outcome: Outcome) -> dict[str, Any]:
 
 
 def _told(chosen: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Mean and spread over the runs of one combination."""
+    """Statistics over the runs of one combination."""
     return {
         "values": dict(chosen),
         "runs": len(rows),
@@ -324,7 +328,7 @@ def _told(chosen: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[
 
 
 def _spread(found: Sequence[float]) -> dict[str, float] | None:
-    """Of the runs of which there is a number; None if of none."""
+    """Statistics of a list of numbers; None if it is empty."""
     if not found:
         return None
     low, median, high = np.quantile(found, [0.1, 0.5, 0.9])

@@ -1,7 +1,7 @@
-"""Verdicts over time: what an observer can certify of a team whose constraints move, at sampled times.
+"""Verdicts over time, for a team with moving constraints: certificates of an observer at sampled times.
 
-A verdict is proven at each sampled time. Between two neighbouring times with the same verdict the team is said to have it, too; where they
-differ the change is looked for by halving the gap, and what is left of it is undecided.
+A verdict is proven at each sampled time. Between two consecutive times with the same verdict the verdict is assumed to hold. Where the
+verdicts differ, the time of the change is narrowed down by bisection, and the remaining gap is undecided.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from consat.problem.objective import margins
 from consat.problem.team import Team
 
 SAMPLES = 120
-"""Times at which a run is looked at, beside those at which schedules bend."""
+"""Largest number of equally spaced intervals at whose ends verdicts are certified; the knots of schedules are added."""
 COSTLY = 2000
-"""Times, times agents, that are certified at most; larger teams are looked at less often."""
+"""Limit of (number of intervals) × (number of agents): larger teams have fewer intervals, at least 8."""
 NARROWED = 6
-"""So often a gap between two different verdicts is halved."""
+"""Number of bisections of a gap between two different verdicts."""
 
 Verdict = Literal["feasible", "infeasible", "undecided"]
 
 
 class Instant(NamedTuple):
-    """What is certified at one time, s.
+    """Certificate at one time.
 
     Attributes:
         time: s.
         verdict: see `consat.certify.certificate.Certificate`.
-        lower: a margin that a formation has.
-        upper: proven bound on the best margin; None if nothing is proven.
+        lower: margin of a known formation, a lower bound on the best margin.
+        upper: proven upper bound on the best margin; None without one.
     """
 
     time: float
@@ -45,12 +45,12 @@ class Instant(NamedTuple):
 def verdicts(
     team: Team, duration: float, seen: Callable[[float], np.ndarray | None], progress: Callable[[float], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Intervals that cover a run, for ``run --json``: ``from``, ``to``, s, ``verdict``, and ``bounds`` over the interval.
+    """Intervals that cover a run, for ``run --json``. Each has ``from`` and ``to``, s, ``verdict``, and ``bounds`` over the interval.
 
     Args:
-        team: whose constraints move.
-        duration: of the run, s.
-        seen: the (N, d) positions in the run at about a time, which may satisfy everybody; None where they are not recorded.
+        team: team with moving constraints.
+        duration: duration of the run, s.
+        seen: returns the positions in the run at about a given time, s, (N, d), as a candidate; None where they are not recorded.
         progress: called with the fraction done.
     """
     samples = int(np.clip(COSTLY // max(team.count, 1), 8, SAMPLES))
@@ -64,7 +64,13 @@ def verdicts(
 
 
 def certify(team: Team, time: float, x: np.ndarray | None) -> Instant:
-    """What is proven at one time: at once if the (N, d) formation x satisfies everybody, else centrally."""
+    """Certificate at one time.
+
+    Args:
+        team: team with moving constraints.
+        time: s.
+        x: (N, d) candidate positions, or None. If they satisfy every constraint they prove feasibility; else the team is solved centrally.
+    """
     here = team.at(time)
     if x is not None and np.isfinite(x).all() and (lower := float(margins(here, x).min(initial=np.inf))) > 0:
         return Instant(time, "feasible", lower, None)
@@ -73,7 +79,7 @@ def certify(team: Team, time: float, x: np.ndarray | None) -> Instant:
 
 
 def _narrowed(team: Team, found: Sequence[Instant], seen: Callable[[float], np.ndarray | None]) -> list[Instant]:
-    """With further times where the verdict changes."""
+    """Add certificates by bisection between times with different verdicts."""
     whole = [found[0]]
     for before, after in itertools.pairwise(found):
         low, high = before, after
@@ -92,7 +98,7 @@ def _narrowed(team: Team, found: Sequence[Instant], seen: Callable[[float], np.n
 
 
 def intervals(found: Sequence[Instant]) -> list[dict[str, Any]]:
-    """Neighbouring times with one verdict become one interval; between different ones nothing is decided."""
+    """Merge consecutive times with the same verdict into one interval. Gaps between different verdicts become undecided intervals."""
     groups: list[list[Instant]] = [[found[0]]]
     for each in found[1:]:
         if each.verdict == groups[-1][-1].verdict:

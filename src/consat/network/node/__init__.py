@@ -1,4 +1,5 @@
-"""One agent: its part of the problem, its neighbours, who is there, when it takes its turns, and its body.
+"""A node of the network, which runs one agent: its part of the problem, neighbours, membership, timing of its steps, and body.
 
-In: a `part.Part`, messages, measurements. Out: messages, commands. Begin with `station`. May not import `consat.network.deploy`.
+Input: a `part.Part`, messages, measurements. Output: messages, commands to the body. Start reading at `station`. Must not import
+`consat.network.deploy`.
 """

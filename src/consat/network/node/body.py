@@ -1,4 +1,4 @@
-"""The body of an agent: it is where it is, and follows the agent's estimate of where to be under a speed limit."""
+"""Sensor and actuator interface of a robot: measured positions, and commands towards the agent's estimate of its own position."""
 
 from __future__ import annotations
 
@@ -7,41 +7,41 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 SLACK: Final = 0.5
-"""A measurement is believed where the body could be by now, and as far beyond as it moves in so long, s."""
+"""Additional travel time, s, in the plausibility check: a measurement is accepted up to speed × (elapsed time + `SLACK`) from the last."""
 VALID: Final = 0.5
-"""A command is valid for so long, s: a robot that has got no other by then must stand."""
+"""Validity of a command, s. A robot that has received no other command by then must stop."""
 CONFIRMED: Final = 5
-"""So many measurements on end that agree with each other, but not with the last good one, are believed: the body was moved."""
+"""Number of consecutive measurements, consistent with each other but not with the last good one, that are accepted: the body was moved."""
 
 
 class Body(Protocol):
-    """Sensor and actuator."""
+    """Sensor and actuator interface of a robot."""
 
     def position(self) -> np.ndarray | None:
-        """(d,) where it is, as far as is known; None before the first measurement."""
+        """(d,) the last known position; None before the first measurement."""
         ...
 
     def sensed(self, now: float) -> bool:
-        """Whether its position is known as of now."""
+        """Whether the position is known at the time `now`, s."""
         ...
 
     def follow(self, target: np.ndarray, now: float) -> np.ndarray:
-        """Go towards `target`, (d,); the velocity commanded, (d,), length/s."""
+        """Move towards `target`, (d,). `now`: time, s. Returns the commanded velocity, (d,), length/s."""
         ...
 
 
 def limited(velocity: np.ndarray, speed: float) -> np.ndarray:
-    """In the same direction, no faster than `speed`."""
+    """The velocity, (d,), scaled down to at most `speed`."""
     size = float(np.linalg.norm(velocity))
     return velocity * (speed / size) if size > speed else velocity
 
 
 class SimulatedBody:
-    """Moves as commanded, from one command to the next.
+    """Simulated body, which moves as commanded.
 
     Args:
-        start: (d,).
-        speed: the most that it moves, length/s; if infinite it is at once where it should be.
+        start: (d,) initial position.
+        speed: largest speed, length/s; if infinite, the body is at its target at once.
     """
 
     def __init__(self, start: np.ndarray, speed: float = np.inf) -> None:
@@ -69,14 +69,14 @@ class SimulatedBody:
 
 
 class Measurement(NamedTuple):
-    """What a sensor said.
+    """One measurement of a sensor.
 
     Attributes:
-        position: (d,) finite.
-        time: when it came, by the agent's clock, s.
-        stamp: the sensor's own number for it, which rises; None if it gives none.
-        heading: which way the body looks, rad; None if nobody says.
-        neighbours: (k, d) where others near it are; None if nobody says.
+        position: (d,) position; finite.
+        time: time of arrival, by the agent's clock, s.
+        stamp: increasing number that the sensor assigns; None without one.
+        heading: heading of the body, rad; None if not measured.
+        neighbours: (k, d) positions of robots nearby; None if not measured.
     """
 
     position: np.ndarray
@@ -87,16 +87,16 @@ class Measurement(NamedTuple):
 
 
 class MeasuredBody:
-    """A real one: its position is measured from outside, and what `follow` returns is commanded to it.
+    """A real body: its position is measured externally, and the result of `follow` is sent to it as a command.
 
-    A measurement that cannot follow the last good one, by its stamp or by its distance, is not believed. After `CONFIRMED` on end that
-    can follow each other the body was moved, and they are. Stamps turn back only after the sensor was silent for `timeout`: it was
-    started anew.
+    A measurement is rejected if it is inconsistent with the last good one, by its stamp or by its distance. After `CONFIRMED` consecutive
+    measurements that are consistent with each other the new position is accepted: the body was moved. Smaller stamps are accepted only
+    after the sensor was silent for `timeout`: it was restarted.
 
     Args:
-        speed: the most that is commanded, length/s. Without one any distance is believed.
-        timeout: a body not measured for so long, s, is not known to be anywhere, and stands.
-        lag: the time in which it would cover the distance, were there no limit, s.
+        speed: largest commanded speed, length/s. If infinite, any distance is plausible.
+        timeout: time without a measurement, s, after which the position counts as unknown, and the body is commanded to stop.
+        lag: time constant of the motion towards the target, s: the commanded velocity is distance/`lag`, limited to `speed`.
     """
 
     valid = VALID
@@ -108,7 +108,7 @@ class MeasuredBody:
         self._agreeing = 0
 
     def measure(self, new: Measurement) -> str | None:
-        """Take in what the sensor says; why not, if it is not believed."""
+        """Process a measurement. Returns the reason if it is rejected, else None."""
         good = self._good
         why = None if good is None else self._doubt(good, new)
         if good is not None and why is not None:
@@ -124,7 +124,7 @@ class MeasuredBody:
         return None
 
     def _doubt(self, last: Measurement, new: Measurement) -> str | None:
-        """Why a measurement cannot follow another one, if it cannot."""
+        """Reason why the measurement `new` is inconsistent with `last`; None if it is consistent."""
         if _turns_back(last, new):
             return f"its stamp is {new.stamp:.17g}, but must be above {last.stamp:.17g}, the last one"
         distance, elapsed = float(np.linalg.norm(new.position - last.position)), max(new.time - last.time, 0.0)
@@ -133,7 +133,7 @@ class MeasuredBody:
         return None
 
     def named(self, command: np.ndarray) -> dict[str, Any]:
-        """A command as it is told."""
+        """A command as fields of a log event."""
         return {"velocity": command.tolist()}
 
     def position(self) -> np.ndarray | None:

@@ -1,8 +1,8 @@
-"""A turn that ends in numbers which are none is not taken: the messages that led there are.
+"""Guard against messages that make the state of an agent NaN or infinite: the step is computed again without these messages.
 
-A message may be well-formed and still be poison, from a neighbour that diverges or lies: an absurd number turns an agent's state into NaN,
-from which no later message frees it. From any sensible state the protocols find their way once the neighbour speaks sense again; an agent
-whose state leads nowhere, whatever it listens to, begins anew.
+A well-formed message of a neighbour that diverges or sends false data can contain absurd numbers. These would turn an agent's state into
+NaN, from which no later message recovers it. From every finite state the protocols recover once the neighbour sends valid messages again.
+If the step fails even without any message, the agent restarts from its initial estimates.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from consat.network.node.core import Embodied, Look, Moment, Rows
 
 
 class Turn(NamedTuple):
-    """What came of a turn.
+    """Result of a guarded step.
 
     Attributes:
-        state: next.
-        outbox: what to say.
-        look: what the agent sees of itself.
-        refused: the neighbours whose messages were left out.
-        anew: whether the state was given up.
+        state: the next state.
+        outbox: messages to send.
+        look: what the agent knows after the step.
+        refused: neighbours whose messages were not used.
+        anew: whether the agent restarted from its initial estimates.
     """
 
     state: Any
@@ -35,7 +35,7 @@ class Turn(NamedTuple):
 
 
 def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turn:
-    """Take a turn, see `Embodied.turn`, without those neighbours whose messages spoil it."""
+    """Compute a step (see `Embodied.turn`) without the messages of neighbours that make the state NaN or infinite."""
     whole = Turn(*core.turn(state, inbox, arrived, moment))
     if _sound(state, whole):
         return whole
@@ -56,19 +56,19 @@ def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment)
 
 
 def _of(core: Embodied, arrived: Rows, neighbours: Collection[str]) -> Rows:
-    """What arrived from some neighbours."""
+    """The mask `arrived`, restricted to some neighbours."""
     link = np.array([other in neighbours for other, _ in core.ends], dtype=bool)
     return Rows(arrived.link & link, arrived.pair & np.array([each.id in neighbours for each in core.part.neighbours], dtype=bool))
 
 
 def _only(core: Embodied, inbox: Rows, arrived: Rows, neighbours: Collection[str]) -> tuple[Rows, Rows]:
-    """What came, and from whom, as if others than these neighbours had said nothing."""
+    """Inbox and mask of arrival, restricted to the messages of some neighbours."""
     kept = _of(core, arrived, neighbours)
     return Rows(*(np.where(there[:, None], numbers, 0.0) for numbers, there in zip(inbox, kept, strict=True))), kept
 
 
 def _sound(before: Any, after: Turn) -> bool:
-    """Whether nothing has become NaN, nor any vector of the state, or position, infinite."""
+    """Whether the step was valid: no entry has become NaN, and no position or array of vectors has become infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after.state), strict=True)
     return bool(np.isfinite(after.look.x).all()) and all(_kept(np.asarray(old), np.asarray(new)) for old, new in pairs)
 
@@ -76,6 +76,6 @@ def _sound(before: Any, after: Turn) -> bool:
 def _kept(old: np.ndarray, new: np.ndarray) -> bool:
     if not np.issubdtype(new.dtype, np.floating):
         return True
-    if new.ndim < 2:  # a margin may be infinite: of an agent without constraints
+    if new.ndim < 2:  # the margin of an agent without constraints is infinite
         return not (np.isnan(new) & ~np.isnan(old)).any()
     return not (~np.isfinite(new) & np.isfinite(old)).any()

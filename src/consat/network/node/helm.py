@@ -1,4 +1,4 @@
-"""Commands to a body that somebody else moves. The first is to stand, and so is the last, whatever ends the agent."""
+"""Commands to an external body. The first and the last command are to stop, however the agent ends."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from consat.network.node.body import MeasuredBody
 from consat.network.node.orders import Orders
 
 PERIOD: Final = 0.1
-"""Time between two commands at most, s."""
+"""Largest time between two commands, s."""
 
 
 class Helm:
-    """Commands a measured body while its position is known; of a simulated one there is nothing to command.
+    """Sends commands to a measured body while its position is known. A simulated body needs no commands.
 
     Args:
-        me: the agent.
-        dimension: of a velocity; as many numbers has each command.
-        body: whose position is measured; None for a simulated one.
-        timeout: after so long without a measurement, s, the sensor counts as lost.
-        write: takes events.
+        me: id of the agent.
+        dimension: number of entries of a command.
+        body: the measured body; None for a simulated one.
+        timeout: time without a measurement, s, after which the sensor counts as lost.
+        write: function that takes events.
     """
 
     def __init__(self, me: str, dimension: int, body: MeasuredBody | None, timeout: float, write: Callable[[dict[str, Any]], None]) -> None:
@@ -37,13 +37,13 @@ class Helm:
         self._command(self._still)
 
     def sense(self, orders: Orders) -> None:
-        """Hand on the measurements that have come, and say which are not believed."""
+        """Pass the received measurements to the body, and log those that it rejects."""
         for line, new in orders.measurements():
             if self._body is not None and (why := self._body.measure(new)) is not None:
                 self._log("rejected", line=line, why=why)
 
     def steer(self, target: np.ndarray | None) -> None:
-        """Command what is due, towards `target`, (d,), if that is known: when it is a new one, and at least every `PERIOD`."""
+        """Send a command towards `target`, (d,), when the target is new, and at least every `PERIOD`; to stop if the target is None."""
         if self._body is None:
             return
         now = time.monotonic()
@@ -59,7 +59,7 @@ class Helm:
         self._command(self._still if target is None or self._over else self._body.follow(target, now))
 
     def stand(self) -> None:
-        """Command to stand, for good."""
+        """Command the body to stop; all later commands are to stop, too."""
         self._over = True
         self._command(self._still)
 

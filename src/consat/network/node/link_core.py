@@ -1,17 +1,18 @@
-"""The gradient flow with its integral state on the links, for continuous control over a network. Agent i, neighbour j, hats: last heard,
+"""Gradient flow with its integral state on the links, for continuous control over a network. With agent i, neighbour j, and hats for values
+as last received:
 
     z_i   = ½ Σ_j (λ_ij − λ̂_ji)
     ẋ_i   = −k1 ∇f_i(x_i) − k2 Σ_j (x_i − x̂_j) − z_i
-    λ̇_ij  = κ_ij (x_i − x̂_j) while j was heard lately, else 0;    κ_ij = min(k1 k2, k2/(2 τ_ij)), τ_ij the delay
+    λ̇_ij  = κ_ij (x_i − x̂_j) while j was heard recently, else 0;    κ_ij = min(k1 k2, k2/(2 τ_ij)), τ_ij the delay
     on receipt:  λ_ij ← λ_ij − ε (λ_ij + λ̂_ji)
 
-by backward Euler with the time h that has really passed,
+It is integrated by backward Euler with the measured time h since the last step,
 
     (1/h + k2 d_i + ½hΣκ) x⁺ + k1 ∇f_i(x⁺) = x/h + k2 Σ x̂_j − z_i + ½hΣκ x̂_j
 
-which is a prox of f_i. On perfect links λ_ij = −λ_ji, and this is the paper's flow (`consat.protocols.gradient_flow`). Where it stands
-still, x_i = x_j and Σ ∇f_i = 0 whatever the λ are, so it mends itself after losses and crashes; and −λ_ji is a live copy of λ_ij, which an
-agent that has lost its memory takes over from its neighbours.
+which is a proximal step of f_i. On perfect links λ_ij = −λ_ji, and this is the paper's flow (`consat.protocols.gradient_flow`). At every
+equilibrium x_i = x_j and Σ ∇f_i = 0, whatever the λ are, so that the flow recovers from losses and crashes. −λ_ji is a copy of λ_ij, which
+an agent that has lost its state takes over from its neighbours.
 """
 
 from __future__ import annotations
@@ -32,22 +33,22 @@ from consat.numerics import quick_compilation
 from consat.protocols.local.proximal import Memory
 
 AGREE = 0.05
-"""ε."""
+"""ε: fraction by which λ_ij moves towards −λ̂_ji at each message."""
 SHORTEST = 1e-4
-"""No step is shorter, s: two turns at once are one."""
+"""Smallest step h, s, for two steps at almost the same time."""
 
 
 class LinkState(NamedTuple):
-    """What an agent remembers.
+    """State of the agent.
 
     Attributes:
         x: (rows, d) estimates.
         force: (E, d) λ_ij.
         there: (E, d) x̂_j.
         theirs: (E, d) λ̂_ji.
-        valid: (E,) whether `theirs` says anything: a neighbour that has lost its memory knows no λ_ji yet.
-        adopted: (E,) whether `force` does.
-        memory: of the solver.
+        valid: (E,) whether `theirs` is valid: a neighbour that has lost its state has no λ_ji yet.
+        adopted: (E,) whether `force` is valid.
+        memory: warm start of the local solver.
     """
 
     x: Array
@@ -65,13 +66,13 @@ _PER: Mapping[str, Any] = {
 
 
 class LinkCore:
-    """The flow on one agent; see the module.
+    """`consat.network.node.core.Core` of the flow; see the module.
 
     Args:
-        whole: the agent's own part.
+        whole: the agent's part, with all agents.
         k1: gain on the gradient, 1/s.
         k2: gain on the disagreement, 1/s.
-        gone: who is not there.
+        gone: agents that are absent.
     """
 
     def __init__(self, whole: Part, k1: float, k2: float, gone: Collection[str] = ()) -> None:
@@ -96,11 +97,11 @@ class LinkCore:
         return LinkCore(whole or self.whole, self.k1, self.k2, gone)
 
     def anew(self, state: LinkState) -> LinkState:
-        """Nothing is proven in it."""
+        """The state unchanged: it contains no proofs."""
         return state
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray, time: float = 0.0) -> LinkState:
-        """All that belongs to ends that live on does."""
+        """Initial state with the old values at the ends of links that remain."""
         return Kept.of(self, other).merge(_PER, state, self.begin(first, time))
 
 
@@ -136,7 +137,8 @@ def _turn(
 
 
 def _hear(solver: Alone, state: LinkState, inbox: Array, arrived: Array) -> LinkState:
-    """Take in what came. Whoever has no λ yet takes over the neighbour's, and its estimates of the others; or 0 if both have none."""
+    """Store the received messages. An agent without a valid λ adopts −λ̂ of the neighbour, and the neighbour's estimates of other positions.
+    If neither has a valid λ, it stays 0."""
     d = state.x.shape[1]
     there, theirs, told = inbox[:, :d], inbox[:, d : 2 * d], inbox[:, 2 * d] > 0
     sure, mine = (arrived & told)[:, None], state.adopted[:, None] > 0

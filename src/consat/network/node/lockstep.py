@@ -1,9 +1,9 @@
-"""Round r+1 waits for every neighbour's round r, so that loss and delay change nothing but the time it takes: any protocol in rounds goes
-exactly as in one process. One agent that is down stops its neighbours until it is back.
+"""Runner in lockstep: round r+1 waits for round r of every neighbour. Every protocol in rounds runs exactly as in a single process; message
+loss and delay only cost time. An agent that is down stops its neighbours until it is back.
 
-Each message carries the rounds r and r − 1, which is all that a neighbour can lack: it waits for r − 1 or for r. Whoever waits says again
-what it said last. An agent writes its state down before it speaks, so that after a crash it says the same again. One that has lost its
-memory starts anew in the round of the slowest neighbour, which a protocol that converges from any state survives.
+Each message contains the rounds r and r − 1, because a neighbour can lack only these: it waits for r − 1 or for r. A waiting agent repeats
+its last message. An agent stores its state before it sends, so that it sends the same message again after a crash. An agent that has lost
+its stored state restarts in the round of its slowest neighbour; a protocol that converges from every state tolerates that.
 """
 
 from __future__ import annotations
@@ -24,29 +24,31 @@ from consat.network.wire import SUPPORT, Kind
 from consat.runs.options import RATE as ROUNDS_A_SECOND
 
 RESEND: Final = 0.006
-"""Whoever waits repeats itself after so long, s, or after `USUAL` times as long as rounds take at best; then after twice as long …"""
+"""Smallest time after which a waiting agent repeats its message, s. It is `USUAL` times the duration of the fastest recent rounds if that
+is longer, and doubles with every repetition up to `SELDOM`."""
 USUAL: Final = 4.0
 SELDOM: Final = 0.2
-"""… up to this: where rounds are slow because the machine is busy, more messages would only make it busier."""
+"""Largest time between repetitions, s: where rounds are slow because the machine is busy, more messages would make it slower."""
 
 
 class Lockstep:
-    """One agent in rounds.
+    """Runner of one agent in lockstep.
 
     Args:
-        station: its own.
-        turns: how many rounds; None for no end. After the last it goes on to answer whoever lacks it.
-        rate: at most so many rounds a second, Hz; as many as there can be if None. Schedules go by rounds: round r is at r/rate.
-        memory: a file in which to keep the state; none if None.
+        station: the agent's station.
+        turns: number of rounds; None for no end. After the last round the agent still repeats it for neighbours that lack it.
+        rate: largest number of rounds per second, Hz; unlimited if None. Round r is at time r/rate for schedules, with a rate of
+            `consat.runs.options.RATE` if None.
+        memory: file in which the state is stored; None for none.
     """
 
     def __init__(self, station: Station, turns: int | None = None, rate: float | None = None, memory: Path | None = None) -> None:
         self.station = station
         self.done = False
         self._turns, self._period = turns, 0.0 if rate is None else 1.0 / rate
-        self._tick = 1.0 / (rate or ROUNDS_A_SECOND)  # time is counted in rounds, as in one process
-        self._round = 0  # so many are spoken
-        self._regrouped = 0  # so many were, when somebody last came or went: a protocol begins anew then
+        self._tick = 1.0 / (rate or ROUNDS_A_SECOND)  # s per round for schedules, as in a single process
+        self._round = 0  # number of rounds computed and sent
+        self._regrouped = 0  # `_round` at the last change of membership, from which a protocol counts its rounds
         self._said: dict[str, list[np.ndarray]] = {}
         self._blocks: dict[str, dict[int, Sequence[np.ndarray]]] = {neighbour: {} for neighbour in station.peers.all}
         self._rumours: dict[str, tuple[int, int]] = {}
@@ -62,16 +64,16 @@ class Lockstep:
         self._recall()
 
     def leave(self) -> None:
-        """Leave for good: say so for a while, then be done."""
+        """Leave for good: announce it in `FAREWELLS` messages, then be done."""
         self.station.membership.drop(self.station.part.me)
         self._farewells = FAREWELLS
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
-        """Raises: InvalidSettings: rounds go as in one process, whose constraints are those of the scenario."""
+        """Raises: InvalidSettings: always; constraints cannot be changed in lockstep."""
         raise InvalidSettings("mode lockstep goes as consat run does, whose constraints stay; run another mode to change them")
 
     def step(self) -> float:
-        """Do what is due; when to be called again at the latest."""
+        """See `Runner.step`."""
         station = self.station
         self._hear()
         now = station.clock()
@@ -92,7 +94,7 @@ class Lockstep:
                 self._turn(now)
             elif now - self._spoke >= self._patience:
                 self._repeat(now)
-        if not self._over() and now - self._began > max(SILENT, 3.0 * self._period):  # while the agent waits, what it knew grows old
+        if not self._over() and now - self._began > max(SILENT, 3.0 * self._period):  # knowledge expires while the agent waits
             station.conclude(float(self._round), lately=False)
         due = station.watch()
         if self._ready() and self._state is not None:
@@ -108,15 +110,15 @@ class Lockstep:
                 if reached > self._round and not self._confirmed(message.source, reached):
                     continue
                 if reached == self._reached.get(message.source):
-                    self._lacking.add(message.source)  # it says again what it has said: it waits
+                    self._lacking.add(message.source)  # a repeated message: the neighbour waits
                 self._reached[message.source] = reached
                 blocks = self._blocks[message.source]
                 due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
                 self._blocks[message.source] = due | {reached: current, reached - 1: previous}
 
     def _confirmed(self, neighbour: str, reached: int) -> bool:
-        """Whether a neighbour that is farther on than it can be, while this agent remembers, has said so several times on end: one
-        mistaken or forged number must not lead this agent into a round that nobody else will ever reach."""
+        """Whether a neighbour has reported an impossibly late round in `SUPPORT` consecutive messages. It can be true only if this agent
+        has lost its state. A single wrong or forged number must not move this agent to a round that no other agent will reach."""
         before, times = self._rumours.get(neighbour, (reached, 0))
         times = times + 1 if 0 <= reached - before <= 1 else 1
         self._rumours[neighbour] = reached, times
@@ -131,12 +133,12 @@ class Lockstep:
         return self._round == 0 or all(map(self._heard, self.station.present))
 
     def _heard(self, neighbour: str) -> bool:
-        """Whether a neighbour has nothing more to say about the round before: it was heard, or is too far on to repeat that."""
+        """Whether the previous round of a neighbour was received, or cannot be received any more because the neighbour is too far ahead."""
         return self._round - 1 in self._blocks[neighbour] or self._reached.get(neighbour, 0) > self._round
 
     def _catch_up(self) -> None:
-        """A neighbour can be one round ahead. If one is farther, this agent has lost its memory, or has just joined: it goes where the
-        slowest is."""
+        """Move to the round of the slowest neighbour if all neighbours have reached this round and one is beyond it. In normal operation a
+        neighbour is at most one round ahead; so this agent has lost its state, or has just joined."""
         reached = [self._reached.get(neighbour, -1) for neighbour in self.station.present]
         if min(reached, default=-1) >= self._round and max(reached) > self._round:
             self._round = min(reached)
@@ -146,7 +148,7 @@ class Lockstep:
     def _turn(self, now: float) -> None:
         station = self.station
         inbox, arrived = station.empty()
-        for neighbour in station.present if self._round else ():  # there is no round before the first
+        for neighbour in station.present if self._round else ():  # no messages before the first round
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.sort(neighbour, block, inbox, arrived)
         moment = self._moment(self._round - self._regrouped)
@@ -164,7 +166,7 @@ class Lockstep:
             station.report()
 
     def _moment(self, number: int) -> Moment:
-        """Of a round, in which everybody was heard, however long it took."""
+        """The `Moment` of a round: without delays, and with all neighbours fresh. `number`: rounds since the last change of membership."""
         count = len(self.station.core.ends)
         time = (self._round + 1.0) * self._tick
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
@@ -180,7 +182,7 @@ class Lockstep:
         station.say(self._said)
 
     def _repeat(self, now: float) -> None:
-        """Say again what was said last: to all while waiting, and after the last round to those who ask."""
+        """Repeat the last message: to all neighbours while waiting, and after the last round to those that lack it."""
         station = self.station
         to = [neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking]
         self._spoke = now
@@ -202,7 +204,7 @@ class Lockstep:
         rows = [place.get(end, -1) for end in station.core.ends]
         if min(rows, default=0) >= 0 and not self._outbox[0].pair.size:
             self._outbox = self._among(rows, self._outbox[0]), self._among(rows, self._outbox[1])
-        else:  # somebody joined, to whom nothing was said yet; or what was said to neighbours as a whole is of a team that is no more
+        else:  # an agent has joined, or messages per neighbour refer to the old membership: compute new messages
             inbox, nothing = station.empty()
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
             self._outbox = outbox, outbox
@@ -210,13 +212,13 @@ class Lockstep:
         self._speak(station.clock())
 
     def _among(self, rows: list[int], said: Rows) -> Rows:
-        """What was said to those who are still there, in protocols that say nothing to neighbours as a whole."""
+        """The rows of messages to neighbours that remain, for protocols without messages per neighbour."""
         return Rows(said.link[rows], np.zeros((len(self.station.present), 0)))
 
-    # -- memory ------------------------------------------------------------------------------------------------------------------------
+    # -- stored state ------------------------------------------------------------------------------------------------------------------
 
     def _size(self) -> int:
-        """Of the record when everybody is there, the most that there can be."""
+        """Largest size of the stored record, in bytes: that with all agents present."""
         everyone = self.station.core.among(frozenset())
         state = everyone.begin(self.station.part.first)
         longest = max((letter.shape[0] for letter in everyone.letters.values()), default=0)
@@ -245,7 +247,7 @@ class Lockstep:
         at = 1 + len(ids)
 
         def read(like: Any) -> Any:
-            """Numbers of the same shapes, from where the last ended."""
+            """Read the next numbers of the record in the shapes of `like`."""
             nonlocal at
             leaves, structure = jax.tree.flatten(like)
             restored = []

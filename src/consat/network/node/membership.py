@@ -1,6 +1,8 @@
-"""Who is there. Every agent passes on, with each message, a number for each position that it shares with the neighbour: how often that
-agent has come and gone. Even: it is there; odd: it left for good. The larger number is the newer, so all who hold a copy of its position
-learn of it in whatever order messages arrive, as often as they are repeated, over the links among them alone.
+"""Membership: which agents are present.
+
+Every message contains a number for each position that both ends share: how often its owner has left and joined. An even number means that
+the agent is present, an odd number that it has left for good. The larger number is the newer one. So every holder of a copy learns about a
+change, over the links between the holders alone, in whatever order messages arrive and however often they are repeated.
 """
 
 from __future__ import annotations
@@ -12,14 +14,14 @@ import numpy as np
 from consat.network.node.part import Part
 
 MOST = 2.0**31
-"""A number beyond is not believed. It is even: whoever is said to have left, and has not, can always answer with a larger number."""
+"""Largest accepted number. It is even, so that an agent that is falsely reported as absent can always answer with a larger number."""
 
 
 class Membership:
-    """What one agent knows of who is there.
+    """Membership as one agent knows it.
 
     Args:
-        part: the agent's own; those `absent` in it have left before the beginning, but the agent itself is there.
+        part: the agent's part. Agents in `part.absent` start as absent, except the agent itself.
     """
 
     def __init__(self, part: Part) -> None:
@@ -30,17 +32,21 @@ class Membership:
 
     @property
     def gone(self) -> frozenset[str]:
-        """Who is not there."""
+        """The absent agents."""
         return frozenset(agent for agent, epoch in self._epoch.items() if epoch % 2)
 
     def of(self, agents: Iterable[str]) -> np.ndarray:
-        """Their numbers."""
+        """The membership numbers of some agents."""
         return np.array([self._epoch[agent] for agent in agents], dtype=float)
 
     def hear(self, agents: Iterable[str], epochs: np.ndarray) -> bool:
-        """Take in what a neighbour says of some agents; whether anything is new.
+        """Update the numbers with those of a neighbour. Returns whether the number of another agent has changed.
 
-        Whoever is told that it has left itself, and has not, says so with a larger number.
+        If the neighbour reports this agent as absent, it raises its own number, which contradicts the report.
+
+        Args:
+            agents: ids.
+            epochs: their numbers, as received.
         """
         news = False
         for agent, told in zip(agents, epochs, strict=True):
@@ -54,14 +60,14 @@ class Membership:
         return news
 
     def drop(self, agent: str) -> None:
-        """`agent` has left for good: the agent itself says so, or another that has waited long enough."""
+        """Mark an agent as absent for good: it is this agent that leaves, or a neighbour that was silent for too long."""
         self._epoch[agent] += 1 - self._epoch[agent] % 2
 
     def adopt(self, other: Membership) -> None:
-        """Take over what another one of the same agent knows, of those that both know."""
+        """Take over the larger numbers of another `Membership` of the same agent, for agents that both contain."""
         for agent in self._epoch.keys() & other._epoch.keys():
             self._epoch[agent] = max(self._epoch[agent], other._epoch[agent])
 
     def restore(self, agents: Iterable[str], epochs: np.ndarray) -> None:
-        """As it was written down before a restart."""
+        """Restore the numbers that were stored before a restart."""
         self._epoch.update(zip(agents, map(int, epochs), strict=True))

@@ -1,4 +1,4 @@
-"""From a part and a word, such as ``admm``, to an agent that runs: which core, which way of taking turns, what it asks of the transport."""
+"""Build the runner of a node from its part and its mode, such as ``admm``: the core, the timing, and the transport's requirements."""
 
 from __future__ import annotations
 
@@ -25,21 +25,24 @@ from consat.protocols import PAIRED, ROUNDS, with_gains
 Mode = Literal["interior-point", "admm", "link", "lockstep"]
 DEFAULT_MODE: Final = "interior-point"
 RATE: Final = {"interior-point": 100.0, "admm": 100.0, "link": 50.0}
-"""Turns a second where nobody says, Hz."""
+"""Default rate of steps, Hz, for each mode."""
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How an agent runs.
+    """Settings of a runner.
 
     Attributes:
-        mode: how it talks.
-        rate: turns a second, Hz; in lockstep, at most so many. None for the mode's own.
-        pace: of link, seconds of the protocol's time in each real one.
-        turns: after how many it is done; None for never.
-        memory: in lockstep, a file in which it keeps its state, so that a restart goes on where it was.
-        give_up: a neighbour silent for so long, s, has left for good.
+        mode: mode of communication.
+        rate: steps per second, Hz; an upper limit in mode lockstep. None for the default of the mode.
+        pace: in mode link, seconds of protocol time per second of real time.
+        turns: number of steps after which the agent is done; None for no end.
+        memory: in mode lockstep, a file for the state, from which a restarted agent continues; None for none.
+        give_up: silence of a neighbour, s, after which it counts as having left for good.
         report: time between two reports, s.
+
+    Raises:
+        InvalidSettings: unknown mode, or a setting that does not apply to it.
     """
 
     mode: Mode = DEFAULT_MODE
@@ -60,46 +63,50 @@ class Manner:
 
     @property
     def reliable(self) -> bool:
-        """Whether the transport should rather wait than drop."""
+        """Whether the transport should block instead of dropping messages."""
         return self.mode == "lockstep"
 
 
 class Runner(Protocol):
-    """An agent that runs, one step after the other."""
+    """An agent that runs step by step."""
 
     @property
     def station(self) -> Station:
-        """Its neighbours, body and log."""
+        """The agent's station: neighbours, body and log."""
         ...
 
     @property
     def done(self) -> bool:
-        """Whether it is."""
+        """Whether the agent has finished."""
         ...
 
     def step(self) -> float:
-        """Do what is due; when to be called again at the latest. To be called as well when a message has come."""
+        """Do what is due. Returns the latest time of the next call, by the station's clock, s. Call it also when a message arrives."""
         ...
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
-        """Go on with other parameters of an own constraint.
+        """Change parameters of one of the agent's own constraints.
+
+        Args:
+            constraint: name of the constraint.
+            parameters: new values of its parameters.
 
         Raises:
-            InvalidTeam: they cannot be; nothing has changed.
-            InvalidSettings: the mode does not allow it.
+            InvalidTeam: the values are invalid; nothing has changed.
+            InvalidSettings: the mode does not allow changes.
         """
         ...
 
     def leave(self) -> None:
-        """Leave for good: the others go on without this agent's constraints."""
+        """Leave the team for good: the others continue without this agent's constraints."""
         ...
 
 
 def protocol_of(mode: Mode, asked: str | None) -> str:
-    """The kind of protocol that runs in a mode, where a scenario asks for one, or for none.
+    """The protocol that runs in a mode. `asked`: protocol of the scenario; None for the default of the mode.
 
     Raises:
-        InvalidSettings: the mode does not run the protocol that is asked for.
+        InvalidSettings: the mode does not support the protocol of the scenario.
     """
     kind = asked or RUNS[mode]
     if mode == "link" and kind != RUNS["link"]:
@@ -119,12 +126,12 @@ def protocol_of(mode: Mode, asked: str | None) -> str:
 
 
 def mode_for(kind: str | None) -> Mode:
-    """How agents talk where nobody says, given the protocol that they are to run."""
+    """Default mode for a protocol."""
     return "admm" if kind == "admm" else DEFAULT_MODE
 
 
 def core_of(part: Part, manner: Manner) -> Embodied:
-    """What the agent computes."""
+    """Build the core of the agent: the protocol compiled for it."""
     asked = part.settings.protocol
     kind = protocol_of(manner.mode, asked.kind)
     if manner.mode == "link":
@@ -146,7 +153,19 @@ def runner_of(
     core: Embodied | None = None,
     wall: Callable[[], float] = time.time,
 ) -> Runner:
-    """An agent ready to run; its first step will begin. `core` is what `core_of` gives, if that is at hand; wall: Unix time, s."""
+    """Build the runner of an agent, which starts with its first step.
+
+    Args:
+        part: the agent's part.
+        manner: settings of the runner.
+        transport: transport of the messages.
+        clock: the agent's clock, s.
+        incarnation: a number that is larger after each restart of the agent.
+        body: sensor and actuator.
+        log: function that takes events.
+        core: result of `core_of`, if it was computed before.
+        wall: Unix time, s.
+    """
     lockstep = manner.mode == "lockstep"
     station = Station(
         part, core or core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,

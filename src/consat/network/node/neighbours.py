@@ -1,4 +1,4 @@
-"""The neighbours as an agent knows them from their messages: what is accepted, how long messages take, how many get lost."""
+"""State of the neighbours, from their messages: acceptance of messages, round-trip times, loss rates."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from consat.network.transports import Transport
 from consat.network.wire import Checker, Expected, Kind, Message, encode
 
 SMOOTH = 0.05
-"""Weight of the newest message in the running means of loss and round trip."""
+"""Weight of the newest message in the running means of loss and round-trip time."""
 
 
 @dataclass
 class Peer:
-    """One neighbour.
+    """State of one neighbour. Times are in s of the agent's own clock.
 
     Attributes:
-        known: what the part says of it.
-        born: when this agent began, own clock; it has sent nothing before.
-        sequence: of the last message sent to it.
-        last: the last message accepted from it.
-        heard: when that was, own clock; −∞ if never.
-        said: when it was last spoken to.
-        trip: round trip, running mean, s; NaN before it is known.
-        lost: share of its messages that did not arrive (in order), running mean.
-        restarts: how often it has begun anew since it was first heard.
+        known: entry of the neighbour in the part.
+        born: start time of this agent, before which it has sent nothing.
+        sequence: sequence number of the last message sent to the neighbour.
+        last: the last message accepted from the neighbour.
+        heard: time of that message; −∞ before the first.
+        said: time of the last message sent to the neighbour.
+        trip: running mean of the round-trip time, s; NaN before the first measurement.
+        lost: running mean of the fraction of its messages that did not arrive, or arrived out of order.
+        restarts: number of restarts of the neighbour since its first message.
     """
 
     known: Neighbour
@@ -43,13 +43,13 @@ class Peer:
     restarts: int = 0
 
     def take(self, message: Message, now: float) -> None:
-        """Learn from an accepted message."""
+        """Update the state with an accepted message, received at time `now`."""
         if self.last is not None and message.incarnation > self.last.incarnation:
             self.restarts += 1
         if self.last is not None and self.last.incarnation == message.incarnation and message.sequence > self.last.sequence:
             gap = message.sequence - self.last.sequence
             self.lost += (1.0 - (1.0 - SMOOTH) ** gap) * ((gap - 1) / gap - self.lost)
-        # An echo of what was never sent is a mistake or a lie, and would spoil the mean for long.
+        # an echo of a time at which nothing was sent is wrong or forged, and would distort the mean for long
         if self.born <= message.echo <= now:
             trip = now - message.echo
             self.trip = trip if np.isnan(self.trip) else self.trip + SMOOTH * (trip - self.trip)
@@ -60,12 +60,12 @@ class Peers:
     """All neighbours of an agent, over a transport.
 
     Args:
-        part: the agent's own.
+        part: the agent's part.
         problem: see `Part.problem`.
-        expected: for each neighbour, what arrays each kind of message has.
-        transport: over which they talk.
-        clock: own, s.
-        incarnation: larger after each restart.
+        expected: for each neighbour the expected arrays of each kind of message.
+        transport: the transport of the messages.
+        clock: the agent's clock, s.
+        incarnation: a number that is larger after each restart of this agent.
     """
 
     def __init__(
@@ -84,11 +84,11 @@ class Peers:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """How many messages were refused, by reason."""
+        """Number of refused messages, by reason."""
         return {str(reason): count for reason, count in self._checker.counts.items()}
 
     def hear(self) -> list[Message]:
-        """The messages that came and pass every check, in the order of their arrival."""
+        """The received messages that pass every check, in the order of their arrival."""
         accepted = []
         for payload in self._transport.receive():
             message = self._checker.accept(payload)
@@ -98,7 +98,7 @@ class Peers:
         return accepted
 
     def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray]) -> None:
-        """Send a message."""
+        """Send a message to a neighbour."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         peer.said = now
@@ -124,5 +124,5 @@ class Peers:
         self.sent["bytes"] += len(payload)
 
     def alive(self) -> frozenset[str]:
-        """Whose liveliness shows."""
+        """Agents that the transport reports as alive."""
         return self._transport.alive()

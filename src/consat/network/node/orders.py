@@ -1,7 +1,7 @@
-"""What an agent's process is told: orders and measurements, as lines on stdin, and signals.
+"""Input of an agent's process: orders and measurements as lines on stdin, and signals.
 
-An order is a JSON object with a ``command``, one of `KEYS`. Whether it has the keys that it must have is checked here, what it says of
-constraints where these are known.
+An order is a JSON object with the key ``command``, whose value is a key of `KEYS`. Required keys are checked here; names and values of
+constraint parameters are checked by `Station.change`.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from consat.network.node.body import Measurement
 from consat.network.node.core import LARGEST
 
 LONGEST_LINE: Final = 65536
-"""Bytes read of a line on stdin."""
+"""Largest number of bytes of a line on stdin; the rest is cut off."""
 SHOWN: Final = 80
-"""Characters of a line that are reported."""
+"""Largest number of characters of a line in a report."""
 HELD: Final = 256
-"""Measurements, and lines to report, that are kept while the agent is busy: the newest."""
+"""Size of each queue while the agent is busy. Of measurements and of rejected lines the newest are kept; further orders are rejected."""
 
 
 KEYS: Final[dict[str, tuple[str, ...]]] = {
     "stop": (), "leave": (), "join": (), "clock": ("epoch",), "reload": (), "change": ("constraint",),
 }  # fmt: skip
-"""The commands, and which keys each must have; a change has parameters besides, the others no more."""
+"""Commands and the required keys of each. ``change`` has parameters as additional keys; the other commands have no additional keys."""
 EXAMPLE: Final = '{"position": [...]}, {"command": "stop"}, {"command": "leave"} or {"command": "change", "constraint": ..., ...}'
 
 
 class Order(NamedTuple):
-    """A command that is well-formed.
+    """A well-formed order.
 
     Attributes:
-        command: see `KEYS`.
-        given: what comes with it.
-        line: as it was told, cut where it is long.
+        command: a key of `KEYS`.
+        given: the other keys and values of the order.
+        line: the line on stdin, cut to `SHOWN` characters.
     """
 
     command: str
@@ -54,7 +54,12 @@ class Order(NamedTuple):
 
 
 def order_of(told: Any, line: str) -> Order | str:
-    """The order that a JSON value is, or why it is none."""
+    """Parse a JSON value as an order. Returns the order, or the reason why it is not one.
+
+    Args:
+        told: the JSON value.
+        line: its line on stdin.
+    """
     command = told.get("command") if isinstance(told, dict) else None
     if not isinstance(command, str):
         return f"it must be {EXAMPLE}"
@@ -76,10 +81,10 @@ def order_of(told: Any, line: str) -> Order | str:
 
 
 class Orders:
-    """What stdin and signals have said.
+    """Queues of orders and measurements from stdin, read in a thread, and flags set by signals.
 
     Args:
-        dimension: of measured positions; None where nobody measures any.
+        dimension: d of measured positions; None for an agent with a simulated body.
         reading: whether to read stdin.
     """
 
@@ -94,16 +99,16 @@ class Orders:
             threading.Thread(target=self._read, name="stdin", daemon=True).start()
 
     def measurements(self) -> Iterator[tuple[str, Measurement]]:
-        """The lines that are measurements, each once."""
+        """The received measurements with their lines, each once."""
         while self._measurements:
             yield self._measurements.popleft()
 
     def next(self) -> Order | None:
-        """The next of the orders but to stop and to leave, each once; None where none waits."""
+        """The next order other than ``stop`` and ``leave``, each once; None without one."""
         return self._others.popleft() if self._others else None
 
     def rejected(self) -> Iterator[tuple[str, str]]:
-        """The lines that mean nothing, each once, and why."""
+        """The rejected lines with the reasons, each once."""
         while self._rejected:
             yield self._rejected.popleft()
 
@@ -114,7 +119,7 @@ class Orders:
         self.stopped = self.stopped or "stdin ended"
 
     def _take(self, line: str) -> str | None:
-        """Heed a line; or why not."""
+        """Process a line. Returns the reason if it is rejected, else None."""
         try:
             told = json.loads(line)
         except (ValueError, RecursionError):
@@ -156,9 +161,9 @@ class Orders:
 
 
 def _lines(descriptor: int) -> Iterator[str]:
-    """The lines of a file. One longer than `LONGEST_LINE` is cut there; a byte that is no UTF-8 becomes a mark.
+    """The lines of a file descriptor. Lines are cut to `LONGEST_LINE` bytes; invalid UTF-8 is replaced.
 
-    Not through `sys.stdin`: its lock, held by a thread that waits there, would abort the process at its end.
+    `sys.stdin` is not used: a thread that waits in it holds its lock, which would abort the process at exit.
     """
     rest = b""
     while data := os.read(descriptor, LONGEST_LINE):
@@ -179,7 +184,8 @@ def _is_coordinate(value: Any) -> bool:
 
 @contextmanager
 def heeding_signals(orders: Orders) -> Iterator[None]:
-    """SIGTERM, SIGHUP and Ctrl-C stop the agent after its step, so that it can command to stand, and say goodbye."""
+    """Handle SIGTERM, SIGHUP and Ctrl-C inside the context: they stop the agent after its step, so that it can command its body to stop and
+    send a goodbye."""
 
     def stop(number: int, _: FrameType | None) -> None:
         orders.stopped = signal.Signals(number).name

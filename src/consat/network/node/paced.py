@@ -1,7 +1,8 @@
-"""Each agent takes its turns at a rate of its own, with whatever has come by then: for protocols that bear loss, delay and disorder.
+"""Runner with a fixed rate: each agent steps at its own rate with the messages received so far. For protocols that tolerate message loss,
+delay and reordering.
 
-After a start or restart an agent stands still and is silent but for greetings, until it has heard its neighbours, or one of them and then
-`PATIENCE`; with none it waits.
+After a start or restart an agent stands still and sends only greetings. It begins when it has heard all its neighbours, or `PATIENCE` after
+the first one; while it has heard none it waits. An agent without neighbours begins at once.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from consat.network.node.station import Station
 from consat.network.wire import Kind
 
 PATIENCE: Final = 3.0
-"""s."""
+"""Largest waiting time for further neighbours after the first one was heard, s."""
 GREETING: Final = 0.05
 """Time between greetings, s."""
 FAREWELLS: Final = 30
-"""So often an agent that leaves for good says so: enough under heavy loss."""
+"""Number of messages in which a leaving agent announces it: enough under heavy message loss."""
 
 
 class Paced:
-    """One agent in time.
+    """Runner of one agent with a fixed rate.
 
     Args:
-        station: its own.
-        rate: turns a second, Hz.
-        turns: how many; None for no end.
-        stale: a neighbour not heard for so long, s, does not count as fresh; if None, as long as `Station` takes it to be up.
+        station: the agent's station.
+        rate: steps per second, Hz.
+        turns: number of steps; None for no end.
+        stale: time without a message, s, after which a neighbour does not count as fresh; at least 3 periods.
     """
 
     def __init__(self, station: Station, rate: float, turns: int | None = None, stale: float = 0.5) -> None:
@@ -46,16 +47,16 @@ class Paced:
         self._farewells = 0
 
     def leave(self) -> None:
-        """Leave for good: say so for a while, then be done."""
+        """Leave for good: announce it in `FAREWELLS` messages, then be done."""
         self.station.membership.drop(self.station.part.me)
         self._farewells = FAREWELLS
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
-        """See `Station.change`."""
+        """See `Runner.change` and `Station.change`."""
         self._state = self.station.change(self._state, constraint, parameters)
 
     def step(self) -> float:
-        """Do what is due; when to be called again at the latest."""
+        """See `Runner.step`."""
         station = self.station
         for message in station.hear():
             if message.kind is Kind.STATE:

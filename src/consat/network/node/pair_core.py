@@ -1,14 +1,14 @@
-"""A protocol that speaks to each neighbour as a whole, `consat.protocols.interior_point`, on one agent.
+"""Core of one agent for the interior-point protocol, `consat.protocols.interior_point`, which sends one message per neighbour.
 
-What it knows of the team beyond the neighbours must outlive neither a lie nor a change of the team:
+Knowledge about the team beyond the neighbours must become invalid after false messages and after changes of the team:
 
-* A bound is the best of the last `FORGET` to twice as many turns.
-* Whenever an agent's constraints change, because somebody has left or joined, it raises a count of changes, which travels with every
-  message; all take over the largest. A proof counts only where it comes with the agent's own count, and begins anew when that rises. So
-  every agent has one set of constraints for each count, and a bound is one on the margin of these.
-* A proof speaks of a region around the team's middle that everybody has known since the beginning. An agent whose constraints ask for more
-  than `FAR` reaches, because they were changed, tells no proof.
-* The least margin behind a neighbour that has fallen silent is unknown.
+* The bound is the best one of the last `FORGET` to 2 `FORGET` steps.
+* An agent whose constraints change (also because an agent has left or joined) raises its count of changes. Every message contains the
+  count, and every agent adopts the largest one. A proof is used only if its count equals the agent's own; proofs restart when the count
+  rises. So for each count every agent has one set of constraints, and the bound is valid for these.
+* A proof holds for a region around the team's centre that is common knowledge from the start. An agent sends no proof while its constraints
+  reach farther than `FAR` reaches from the centre, because they were changed.
+* The smallest margin behind a silent neighbour is unknown.
 """
 
 from __future__ import annotations
@@ -32,18 +32,19 @@ from consat.protocols import InteriorPoint, Known
 from consat.protocols.interior_point import InteriorState
 
 FORGET: Final = 300
-"""Turns."""
+"""Number of steps after which a bound may be forgotten."""
 FAR: Final = 3.0
-"""The region of a proof is ten reaches wide: so an agent may follow its neighbours some way farther than its own constraints ask for."""
+"""Largest distance, in reaches, to which the constraints of an agent with proofs may lead. The region of a proof has a radius of ten
+reaches, so that agents may follow their neighbours farther than their own constraints require."""
 
 
 class PairState(NamedTuple):
-    """What an agent remembers.
+    """State of the agent.
 
     Attributes:
-        inner: of the protocol.
-        bounds: (2,) the best of so many turns before, and since.
-        turns: taken.
+        inner: state of the protocol.
+        bounds: (2,) the best bound of the last complete period of `FORGET` steps, and of the present period.
+        turns: () number of steps.
     """
 
     inner: InteriorState
@@ -52,12 +53,12 @@ class PairState(NamedTuple):
 
 
 class PairCore:
-    """The protocol on one agent; see the module.
+    """`consat.network.node.core.Core` of the interior-point protocol; see the module.
 
     Args:
         protocol: the protocol.
-        whole: the agent's own part.
-        gone: who is not there.
+        whole: the agent's part, with all agents.
+        gone: agents that are absent.
     """
 
     def __init__(self, protocol: InteriorPoint, whole: Part, gone: Collection[str] = ()) -> None:
@@ -98,14 +99,14 @@ class PairCore:
         return PairCore(self.protocol, whole or self.whole, gone)
 
     def anew(self, state: PairState) -> PairState:
-        """With a count of changes that is larger by one, and nothing proven."""
+        """Copy of the state with the count of changes raised by one, and without bounds."""
         memory: Any = state.inner.memory
-        more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # nothing compiles
+        more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # JAX would compile
         forgotten: Any = np.full(2, np.inf)
         return state._replace(inner=state.inner._replace(memory=memory._replace(**more)), bounds=forgotten)
 
     def carry(self, other: Core, state: PairState, first: np.ndarray, time: float = 0.0) -> PairState:
-        """Only the estimates live on, and the count of changes, which this is one of."""
+        """Initial state with the old estimates, and with the count of changes raised by one."""
         fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)), time)
         memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
         return fresh._replace(inner=fresh.inner._replace(memory=memory))
@@ -113,7 +114,7 @@ class PairCore:
 
 @functools.lru_cache(maxsize=64)
 def asks_for(part: Part) -> float:
-    """How far from the team's middle an agent's own constraints ask anybody to be, length."""
+    """Largest distance from the team's centre to which the agent's constraints may lead an agent, length."""
     return max((farthest(family.psi, family.parameters, part.center) for family in part.team.families), default=0.0)
 
 
@@ -122,8 +123,8 @@ def _begin(protocol: InteriorPoint, solver: Alone, first: Array, time: Array) ->
 
 
 def _strong(state: PairState) -> PairState:
-    """The same with types of its own, not those of what it meets: the first state must have those of all later ones, or JAX compiles a
-    turn twice."""
+    """Copy of the state with strong types in place of JAX's weak types: the first state must have the types of the later ones, or JAX
+    compiles a step twice."""
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), state)
 
 
@@ -156,7 +157,7 @@ def _turn(
 
 @functools.cache
 def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Compiled once for all agents of the same shape."""
+    """The compiled functions, which all agents of the same shape share."""
     options = quick_compilation()
     return (
         jax.jit(_begin, static_argnames=("protocol",), compiler_options=options),

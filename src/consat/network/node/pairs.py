@@ -1,9 +1,9 @@
-"""How mail of `consat.protocols.local.interior` is written as the numbers of a message: of symmetric matrices the triangle alone, and of
-all only what two neighbours share.
+"""Serialisation of `consat.protocols.local.interior.Mail` as the numbers of a message. Of symmetric matrices only the upper triangle is
+stored, and only for variables that the two neighbours share:
 
     changes, μ, t, least margin, then upper triangle and vector of the quadratic; Σλ, c, error, then triangle and vector of the proof
 
-A message has the same length whoever is there; what belongs to those who have gone is 0.
+The length of a message does not depend on the membership; entries of absent agents are 0.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from consat.numerics import on_device
 from consat.protocols.local.interior import Mail, Proof
 
 INDEFINITE: Final = 1e-6
-"""A quadratic is refused of which an eigenvalue is below zero by more than this part of the largest: rounding leaves less."""
+"""A quadratic is refused if its smallest eigenvalue is below −`INDEFINITE` times the largest; rounding errors are smaller."""
 HEAD: Final = 4
-"""Numbers before the quadratic: changes, μ, t and the least margin."""
+"""Number of entries before the quadratic: changes, μ, t and the least margin."""
 TAIL: Final = 3
-"""Numbers before that of the proof: Σλ, c and the error."""
+"""Number of entries before the quadratic of the proof: Σλ, c and the error."""
 
 
 class Letter(NamedTuple):
-    """What a message to one neighbour consists of.
+    """Layout of the messages to one neighbour.
 
     Attributes:
-        names: whose coordinates are shared, each d times, and last None for the level, if it is.
-        level: whether it is.
+        names: shared variables: (agent, axis) for each coordinate, and last None for the level, if it is shared.
+        level: whether the level is shared.
     """
 
     names: tuple[tuple[str, int] | None, ...]
@@ -47,40 +47,46 @@ class Letter(NamedTuple):
 
     @classmethod
     def of(cls, neighbour: Neighbour, dimension: int) -> Letter:
-        """Of a neighbour, in a space of so many dimensions."""
+        """Layout for a neighbour. `dimension`: d."""
         places = [(agent, axis) for agent in neighbour.travels for axis in range(dimension)]
         return cls((*places, *[None] * neighbour.level), neighbour.level)
 
     @property
     def size(self) -> int:
-        """p."""
+        """p, the number of shared variables."""
         return len(self.names)
 
     @property
     def length(self) -> int:
-        """How many numbers."""
+        """Number of entries of a message."""
         return HEAD + _both(self.size) + TAIL + _both(self.size - self.level)
 
     @property
     def weight(self) -> int:
-        """The place of Σλ, with which the proof begins."""
+        """Index of Σλ, the first entry of the proof."""
         return HEAD + _both(self.size)
 
     def numbers(self) -> Numbers:
-        """What such a message must be."""
+        """Validity conditions of such a message: shape, largest values, and `sound`."""
         largest = np.full(self.length, LARGEST)
         largest[0], largest[3] = MOST, np.inf
         return Numbers((self.length,), tuple(largest.tolist()), functools.partial(sound, self.size, self.level))
 
 
 def _both(size: int) -> int:
-    """Numbers of a triangle and a vector."""
+    """Number of entries of a triangle and a vector."""
     return size * (size + 1) // 2 + size
 
 
 def sound(size: int, level: bool, numbers: np.ndarray) -> bool:
-    """Whether a message of p = `size` shared variables is one that an agent of sense can have sent: both quadratics positive semidefinite
-    within rounding, a count that is one, no weight and no barrier negative, but −1 where nothing is said."""
+    """Whether a message can come from a correct agent: both quadratics are positive semidefinite within rounding, the count of changes is a
+    whole number from 0, the error is not negative, and weight and barrier are −1 (absent) or not negative.
+
+    Args:
+        size: p, the number of shared variables.
+        level: whether the level is one of them.
+        numbers: the entries of the message.
+    """
     at = HEAD + _both(size)
     changes, barrier = numbers[:2]
     weight, _, error = numbers[at : at + TAIL]
@@ -104,11 +110,11 @@ def _semidefinite(numbers: np.ndarray, size: int) -> bool:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Packing:
-    """Between mail, leading axis G, and the numbers of messages to G neighbours, padded to the longest.
+    """Index tables between the mail to G neighbours, flattened to F numbers each, and their messages of up to W numbers.
 
     Attributes:
-        out: (G, W) which number of the mail of a neighbour, all in a row, is the next of its message; padded with how many there are.
-        back: (G, F) where in the message each number of its mail is; padded with W.
+        out: (G, W) index in the flat mail of each entry of the message; padded with F.
+        back: (G, F) index in the message of each entry of the flat mail; padded with W.
     """
 
     out: Array
@@ -116,7 +122,13 @@ class Packing:
 
     @classmethod
     def of(cls, whole: Part, part: Part, width: int) -> Packing:
-        """Args: whole: by which messages are laid out; part: among those who are there; width: p of the mail."""
+        """Compute the index tables.
+
+        Args:
+            whole: the agent's part with all agents, which determines the layout of messages.
+            part: the part without absent agents, which determines the mail.
+            width: p of the mail.
+        """
         dimension, known = whole.team.dimension, {neighbour.id: neighbour for neighbour in whole.neighbours}
         letters = [Letter.of(known[neighbour.id], dimension) for neighbour in part.neighbours]
         kept = [Letter.of(neighbour, dimension) for neighbour in part.neighbours]
@@ -132,11 +144,11 @@ class Packing:
 
     @property
     def longest(self) -> int:
-        """W."""
+        """W, the length of the longest message."""
         return self.out.shape[1]
 
     def pack(self, mail: Mail) -> Array:
-        """(G, W) from the mail."""
+        """(G, W) the messages for a mail."""
         count = len(self.out)
         proof = mail.proof
         leaves = (
@@ -148,7 +160,7 @@ class Packing:
         return jnp.take_along_axis(flat, self.out, axis=1)
 
     def unpack(self, packed: Array, width: int) -> Mail:
-        """The mail."""
+        """The mail of messages, (G, W). `width`: p of the mail."""
         count = len(self.back)
         flat = jnp.take_along_axis(jnp.concatenate([packed, jnp.zeros((count, 1))], axis=1), self.back, axis=1)
         cut = _Flat(width)
@@ -159,13 +171,13 @@ class Packing:
 
 
 class _Flat(NamedTuple):
-    """All numbers of the mail to one neighbour in a row: single ones first, then both quadratics."""
+    """Layout of the flat mail to one neighbour: first the scalars, then both quadratics. `width`: p of the mail."""
 
     width: int
 
     @property
     def arrays(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-        """Begin, end and shape of each array."""
+        """Begin, end and shape of each array in the flat mail."""
         at, p = HEAD + TAIL, self.width
         for shape in ((p, p), (p,), (p, p), (p,)):
             size = int(np.prod(shape))
@@ -174,12 +186,18 @@ class _Flat(NamedTuple):
 
     @property
     def total(self) -> int:
-        """F."""
+        """F, the number of entries."""
         return HEAD + TAIL + 2 * (self.width**2 + self.width)
 
 
 def _layout(letter: Letter, there: Letter, flat: _Flat) -> Iterator[list[int]]:
-    """For each number of a message the numbers of the mail that are equal to it: none where somebody has gone."""
+    """For each entry of a message the indices of the equal entries of the flat mail; none for absent agents.
+
+    Args:
+        letter: layout of the message, with all agents.
+        there: layout of the mail, without absent agents.
+        flat: layout of the flat mail.
+    """
     place = {name: k for k, name in enumerate(there.names)}
     matrix, vector, slope, force = (begin for begin, *_ in flat.arrays)
     yield from ([k] for k in range(3))

@@ -1,9 +1,9 @@
-"""What one agent is given: its own constraints, the positions it holds, its neighbours' names and addresses, and common knowledge.
+"""The part of a scenario that one agent gets: its own constraints, the positions that it holds, its neighbours, and common knowledge.
 
-`split` makes the parts of a scenario, `write_part` and `read_part` put them into private files. A file is a scenario of one agent, in the
-same words, in a frame that says how it talks to its neighbours; nothing in it is ever evaluated. It tells of the other agents only their
-names, and of neighbours their addresses, which positions both hold, how many links share each at the other end, and what travels between
-them.
+`split` computes the parts of a scenario; `write_part` and `read_part` write and read them as private files. A file contains a scenario with
+one agent, in the format of scenario files, inside a frame with the data for communication. No text in it is evaluated as code. A file
+discloses only the names of the other agents, and for neighbours their addresses, the positions that both hold, the number of links that
+share each of these at the other end, and the variables exchanged with them.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from consat.scenario.writing import write
 from consat.settings import Gain, Model, Number, Settings, Smoothing
 
 VERSION: Final = 2
-"""Since parts tell along which links positions and the level travel. Others are refused."""
+"""Version of the file format; other versions are refused. Version 2 added the links along which positions and the level are exchanged."""
 PORT: Final = 7447
-"""Of the first agent, where nobody says."""
+"""Default port of the first agent."""
 
 RUNS: Final = {"interior-point": "interior-point", "admm": "admm", "link": "gradient-flow", "lockstep": "interior-point"}
-"""The protocol of each mode, where nobody names one."""
+"""Default protocol of each mode."""
 
 Word = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 Endpoint = Annotated[str, StringConstraints(pattern=r"^(tcp|tls|udp|quic)/[^\s/]+:[0-9]{1,5}$")]
 
 
 class Neighbour(Model):
-    """What an agent knows of one it talks to.
+    """What an agent knows about one neighbour.
 
     Attributes:
-        id: its name.
-        address: where it listens.
-        shares: the agents whose positions both ends hold, in the team's order.
-        degrees: for each of them, over how many links the neighbour shares it.
-        travels: those of `shares` whose positions travel over this link in the interior-point protocol, each along a tree of its holders.
-        level: whether the level does, along a spanning tree of the cluster.
+        id: id of the neighbour.
+        address: address at which it listens.
+        shares: agents whose positions both ends hold, in the team's order.
+        degrees: for each agent in `shares` the number of links over which the neighbour shares its position.
+        travels: the agents in `shares` whose positions the interior-point protocol exchanges over this link (trees of their holders).
+        level: whether the interior-point protocol exchanges the level over this link (spanning tree of the cluster).
     """
 
     id: Word
@@ -64,7 +64,7 @@ class Neighbour(Model):
 
 
 class _File(Model):
-    """The frame of a part file."""
+    """Schema of the frame of a part file; see `Part`."""
 
     version: int = Field(alias="consat-part")
     run: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -88,30 +88,31 @@ class _File(Model):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One agent's own part of a scenario.
+    """The part of a scenario that one agent gets.
 
     Attributes:
-        name: of the scenario.
-        run: names the team's run on the network; agents of other runs are not heard.
-        me: the agent.
-        listen: its own address.
+        name: name of the scenario.
+        run: name of the team's run on the network; messages of other runs are ignored.
+        me: id of the agent.
+        listen: address at which the agent listens.
         length: the team's unit of length.
         psi: the team's unit of ψ; see `consat.protocols.local.interior.Units`.
-        center: (d,) the team's middle.
-        reach: how far around it the team's places are; see `consat.problem.units.Region`.
+        center: (d,) centre of the team's region.
+        reach: half width of the region on each axis, length; see `consat.problem.units.Region`.
         convex: whether every ψ of the team is proven concave.
-        exact: whether what agents share travels along trees, so that proofs can be told; see `consat.protocols.local.interior.layout.Plan`.
-        hops: links that a message crosses, at most, from one agent to another.
-        team: a team in which it alone has constraints; the others are the agents whose positions it holds.
+        exact: whether the agents can prove bounds, because all used links form a tree; see
+            `consat.protocols.local.interior.layout.Plan`.
+        hops: largest number of links between two agents.
+        team: a team of the agents whose positions this agent holds, in which only this agent has constraints.
         settings: protocol and smoothing.
-        first: (copies, d) first estimates of the positions it holds, in the order of `team.ids`.
-        absent: agents that are not there in the beginning, and may join.
-        neighbours: whom it talks to, in the team's order.
-        epoch: when t = 0 is, s of Unix time; None where nobody has said yet.
-        generation: how often the team has been split anew since it began: agents of other generations are not understood, for what they say
-            may travel along other links.
-        extent: how far beyond `reach` constraints may lead, length; see `consat.problem.units.Scale`.
-        robots: what its body is, and the public map; None for a point that goes where it wants.
+        first: (copies, d) initial estimates of the positions that the agent holds, in the order of `team.ids`.
+        absent: agents that are absent at the start and may join.
+        neighbours: the neighbours, in the team's order.
+        epoch: Unix time of t = 0, s; None if not set yet.
+        generation: number of times the team has been split again since it started. Messages of other generations are ignored, because they
+            may be exchanged along other links.
+        extent: distance beyond `reach` to which constraints may lead, length; see `consat.problem.units.Scale`.
+        robots: model of the agent's body, and the public map; None for a point.
     """
 
     name: str
@@ -137,14 +138,14 @@ class Part:
 
     @property
     def nu(self) -> Nu:
-        """The smoothing, constant over a run: whoever starts anew later has the same."""
+        """The smoothing, which is constant during a run, so that an agent that restarts has the same."""
         smoothing = self.settings.smoothing
         assert isinstance(smoothing, Smoothing)
         assert isinstance(smoothing.nu_beta, float)
         return Nu(smoothing.nu_alpha, smoothing.nu_beta)
 
     def problem(self, mode: str) -> bytes:
-        """8 bytes that agree among agents of the same run, mode and common knowledge; nothing private is in them."""
+        """Hash (8 bytes) of the run, the mode and the common knowledge. It is the same for all agents of a run; no private data enters."""
         settings = self.settings.model_dump(mode="json", include={"protocol", "smoothing"})
         settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
@@ -156,7 +157,7 @@ class Part:
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
 
     def without(self, gone: Collection[str]) -> Part:
-        """What is left when some agents are not there: no constraint that reads them, no copy of them, no link to them."""
+        """The part without some agents: without constraints that read their positions, copies of these, and links to the agents."""
         if not gone:
             return self
         kept = [number for number, agent in enumerate(self.team.ids) if agent not in gone]
@@ -176,7 +177,7 @@ class Part:
 
 
 def _restricted(team: Team, kept: Sequence[int]) -> Team:
-    """The team of some of its agents, with the constraints that read only them."""
+    """Sub-team of the agents `kept`, with the constraints that read only their positions."""
     place = np.full(team.count, -1, dtype=np.int32)
     place[list(kept)] = np.arange(len(kept))
     whole = [np.all(place[family.agents] >= 0, axis=1) for family in team.families]
@@ -199,7 +200,7 @@ def _members(family: Family, which: np.ndarray, place: np.ndarray, numbers: np.n
 
 
 def _private(team: Team, owner: int, held: np.ndarray) -> Team:
-    """The team as its agent `owner` may know it: its own constraints over the positions it holds."""
+    """The team as agent `owner` may know it: its own constraints, on the positions of the agents `held`."""
     number = [np.flatnonzero(family.owner == owner) for family in team.families]
     mine = np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(f.number[k] for f, k in zip(team.families, number, strict=True))]))
     place = np.full(team.count, -1, dtype=np.int32)
@@ -221,23 +222,23 @@ def split(
     epoch: float | None = None,
     generation: int = 0,
 ) -> dict[str, Part]:
-    """The parts of a scenario, by agent.
+    """Split a scenario into parts. Returns a mapping from agent to part.
 
-    Who holds what, and along which links it travels, suits the protocol that the scenario names, or the team's default.
+    The layout of the copies and the links along which they are exchanged suit the scenario's protocol, or the team's default protocol.
 
     Args:
-        scenario: whose protocol, seed and smoothing are those of the run.
-        run: its name on the network; if None, one that everybody who splits the same scenario finds.
-        addresses: where agents listen, such as ``tcp/192.168.0.7:7447``; on this machine, one port after the other, where not given.
-        port: the first of them.
-        absent: agents that are not there in the beginning, and may join.
-        only: make the part of this agent alone.
-        epoch: when t = 0 is, s of Unix time.
+        scenario: the scenario, whose protocol, seed and smoothing are those of the run.
+        run: name of the run on the network; by default derived from the scenario's text, so that it is the same on every machine.
+        addresses: agent to address, such as ``tcp/192.168.0.7:7447``; by default consecutive ports on this machine.
+        port: port of the first agent.
+        absent: agents that are absent at the start and may join.
+        only: compute the part of this agent only.
+        epoch: Unix time of t = 0, s.
         generation: see `Part`.
 
     Raises:
         InvalidTeam: a cluster is not connected by links.
-        InvalidSettings: an address or an absent agent that the team does not have.
+        InvalidSettings: an agent that the team does not have, or no room for the ports.
     """
     from consat.certify.quadratics import shape_of
     from consat.problem.graphs import hops
@@ -298,7 +299,7 @@ def split(
 
 
 def _robot(robots: Robots | None, agent: str) -> Robots | None:
-    """Its own, and the map."""
+    """The model of one agent's robot, and the map."""
     return None if robots is None else replace(robots, common=robots.own.get(agent, robots.common), own={})
 
 
@@ -307,10 +308,10 @@ def _word(name: str) -> str:
 
 
 def write_part(part: Part) -> str:
-    """The private file of an agent.
+    """Text of the private file of an agent.
 
     Raises:
-        InvalidTeam: it has constraints that are Python functions; no file can hold them.
+        InvalidTeam: it has constraints that are Python functions, which a file cannot store.
     """
     scenario = read(dump(part.team, part.settings, part.name, robots=part.robots), part.me).root
     assert scenario is not None
@@ -339,22 +340,22 @@ def write_part(part: Part) -> str:
 
 
 def is_part(text: str, file: str) -> bool:
-    """Whether a text is a part file rather than a scenario."""
+    """Whether a text is a part file (not a scenario). `file`: name of the file, for error messages."""
     root = read(text, file).root
     return root is not None and isinstance(root.value, dict) and "consat-part" in root.value
 
 
 def load_text(file: Path) -> str:
-    """The text of a file, of a size that is read at all; raises as `consat.scenario.load` does."""
+    """Text of a file, with the size limit and the errors of `consat.scenario.load`."""
     with file.open("rb") as stream:
         return decode(stream.read(LARGEST + 1), str(file))
 
 
 def read_part(text: str, file: str) -> Part:
-    """Read what `write_part` wrote.
+    """Read a part from a text written by `write_part`. `file`: name of the file, for error messages.
 
     Raises:
-        InvalidScenario: names every fault with its line and column.
+        InvalidScenario: lists every fault with its line and column.
     """
     document = read(text, file)
     data = document.root.plain if document.root else None
@@ -396,12 +397,12 @@ def _complaints(error: ValidationError, data: Any) -> list[Fault]:
 
 
 def _must(message: str) -> str:
-    """Pydantic's words, as consat says it."""
+    """Rephrase an error message of Pydantic in the style of consat."""
     return message.removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
 
 
 def _unfit(frame: _File, team: Team, settings: Settings) -> Iterator[Fault]:
-    """Where the frame and the scenario within contradict each other."""
+    """Contradictions between the frame and the scenario inside."""
     if set(frame.first) != set(team.ids):
         yield Fault(("first",), f"first must have the agents of the scenario within, {', '.join(team.ids)}")
     if len(frame.center) != team.dimension:

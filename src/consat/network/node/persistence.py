@@ -1,6 +1,6 @@
-"""An agent's state on disk, such that it is whole whenever the process dies: two halves written in turn, each with a number and a checksum.
+"""Crash-safe storage of an agent's state: a file with two halves that are written alternately, each with a number and a checksum.
 
-The file is mapped into memory, so that a write costs microseconds and outlives the process. It does not outlive the machine.
+The file is mapped into memory, so that a write takes microseconds and survives the process. It does not survive a crash of the machine.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ _MAGIC: Final = b"csatmem1"
 
 
 class Store:
-    """One record, replaced again and again.
+    """A file with one record that can be replaced.
 
     Args:
-        path: of the file; made if there is none.
-        size: the most bytes that the record will have.
+        path: path of the file; created if missing.
+        size: largest size of the record, in bytes.
 
     Raises:
-        NetworkError: the file belongs to something else.
+        NetworkError: the file has another size, so that it is not the memory of this agent.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -39,7 +39,7 @@ class Store:
         self._number = 0
 
     def load(self) -> bytes | None:
-        """The newest record that is whole, or None."""
+        """The newest complete record, or None."""
         best: tuple[int, bytes] | None = None
         for start in (0, self._half):
             magic, number, length, check = _HEAD.unpack_from(self._map, start)
@@ -55,12 +55,12 @@ class Store:
         return best[1]
 
     def save(self, record: bytes) -> None:
-        """Write it over the older half."""
+        """Write a record over the older half."""
         self._number += 1
         start = self._half * (self._number % 2)
         self._map[start + _HEAD.size : start + _HEAD.size + len(record)] = record
         _HEAD.pack_into(self._map, start, _MAGIC, self._number, len(record), crc32(record, self._number))
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._map.close()

@@ -1,9 +1,9 @@
-"""A robot that somebody else moves: commands of its model, filtered against the neighbours that it measures and the public map.
+"""Body of a real robot: commands of its model, filtered for collisions with measured neighbours and with obstacles of the public map.
 
-The robot layer of `consat.robots` for one robot alone. What is measured of others is the middle of their bodies, so that the planes between
-robots are of middles: after the filter of the steered point a command is scaled down until the middle keeps its side, too. Robots on a
-network decide at times of their own; of a gap they use up half as much in a step as where all decide at once, which leaves room for what
-others have begun. A command is valid for as long as the filter has checked, and no longer.
+This is the robot layer of `consat.robots` for a single robot. Measured positions of neighbours are the centres of their bodies, so that the
+separating planes are between centres. After the filter of the steered point a command is therefore scaled down until the centre stays on
+its side, too. Robots on a network decide at different times: a step may use half as much of a gap as where all decide at once, which leaves
+room for motions that others have already started. A command is valid only for the time that the filter has checked.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from consat.robots.point import Point
 from consat.robots.unicycle import UnicycleState
 
 HELD: Final = 0.2
-"""A command is valid for so long, s, twice the time between two; what the filter checks."""
+"""Validity of a command, s, which the filter checks: twice the time between two commands."""
 SHARE: Final = 0.5
-"""Of a gap that two robots use up in a step."""
+"""Fraction of a gap between two robots that one step may use."""
 SEEN: Final = 8
-"""Neighbours that have a plane of their own; of more, the nearest."""
+"""Largest number of neighbours with a separating plane of their own; the nearest ones are chosen."""
 
 
 class RobotBody(MeasuredBody):
-    """A robot whose position, heading and neighbours are measured from outside.
+    """A robot whose position, heading and neighbours are measured externally.
 
     Args:
-        robots: its model, for one robot, and the map.
+        robots: the model of the robot, and the map.
         dimension: d.
-        timeout: a robot not measured for so long, s, is not known to be anywhere, and stands.
+        timeout: time without a measurement, s, after which the position counts as unknown, and the robot is commanded to stop.
 
     Raises:
-        InvalidSettings: a model that cannot halt at once.
+        InvalidSettings: the model cannot stop at once.
     """
 
     valid = HELD
@@ -52,18 +52,18 @@ class RobotBody(MeasuredBody):
         model = robots.common
         if not isinstance(model, Point | Unicycle):
             raise InvalidSettings(f"a {kind_of(model)} cannot halt at once; on a network point and unicycle are driven")
-        # the neighbours, of unknown models, are taken to be like it
+        # the models of the neighbours are unknown: the same model is assumed
         self._drive = drive = Drive(model, 1, dimension, HELD, robots.obstacles, share=SHARE)
         super().__init__(float(np.max(np.asarray(model.pace(1)))), timeout)
         arc = drive.size[0] - float(np.max(model.radius)) - (float(np.max(model.offset)) if isinstance(model, Unicycle) else 0.0)
-        self._kept = float(np.max(model.radius) + arc)  # around the middle of the body; what it moves within a step is in it
+        self._kept = float(np.max(model.radius) + arc)  # radius around the centre of the body, which contains its motion within a step
         self._planner = Planner(drive.map, float(drive.size[0])) if drive.map.count else None
         self._path = np.zeros((0, dimension))
         self._blocked, self._last = 0.0, 0.0
         self._steer = jax.jit(self._steered, compiler_options=quick_compilation())
         self._heading, self._middle = 0.0, np.zeros(dimension)
         self._near: np.ndarray = np.zeros((0, dimension))
-        self._command(np.zeros(dimension), np.zeros(dimension), 0.0)  # compiled before it is needed
+        self._command(np.zeros(dimension), np.zeros(dimension), 0.0)  # compiles now
 
     def measure(self, new: Measurement) -> str | None:
         turns = isinstance(self._drive.model, Unicycle)
@@ -73,7 +73,7 @@ class RobotBody(MeasuredBody):
         if others is None:
             return "neighbours is missing: the positions of the robots near it, [] for nobody"
         heading, middle = new.heading or 0.0, new.position
-        if isinstance(self._drive.model, Unicycle):  # constraints see the steered point
+        if isinstance(self._drive.model, Unicycle):  # constraints apply to the steered point
             ahead = float(np.max(self._drive.model.offset)) * np.array([np.cos(heading), np.sin(heading)])
             new = new._replace(position=new.position + ahead)
         if (why := super().measure(new)) is None:
@@ -93,7 +93,7 @@ class RobotBody(MeasuredBody):
         return super().named(command)
 
     def _ahead(self, place: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """The next point of the way."""
+        """(d,) next point of the path from `place` to `target`."""
         if self._planner is None:
             return target
         size = float(self._drive.size[0])
@@ -113,7 +113,15 @@ class RobotBody(MeasuredBody):
         return np.array(command)
 
     def _steered(self, everybody: Array, ahead: Array, heading: Array, blocked: Array, elapsed: Array) -> tuple[Array, Array]:
-        """The command of the first of all, whose bodies' middles are (k, d), and by how many right angles it turns its wish from now on."""
+        """The command of the robot, and its state of deadlock resolution: the number of right angles by which its desired motion turns.
+
+        Args:
+            everybody: (k, d) centres of the bodies, this robot first.
+            ahead: (d,) next point of the path.
+            heading: () heading, rad.
+            blocked: () state of deadlock resolution.
+            elapsed: () time since the last command, s.
+        """
         drive, count = self._drive, len(everybody)
         model, size = drive.model, jnp.full(count, self._kept)
         middle = everybody[:1]
@@ -141,8 +149,8 @@ class RobotBody(MeasuredBody):
         return self._within(state, command, first, along(first.normals, own) - first.least)[0], turned[0]
 
     def _within(self, state: Any, command: Array, planes: safety.Planes, room: Array) -> Array:
-        """The command, (1, m), scaled down until the middle of the body comes no farther towards any neighbour than `room`, (1, k), and no
-        farther at all than the planes' slack; to stand, where that does not do."""
+        """The command, (1, m), scaled down until the centre of the body moves towards each neighbour by at most `room`, (1, k), and in
+        total by at most the slack of the planes. If scaling is not sufficient, the command to stop."""
         model = self._drive.model
 
         def moved(command: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""One agent's own objective and own ends of its links: what `consat.protocols` asks for, of a `Part` alone."""
+"""`consat.protocols.Solver` and `Links` of one agent, built from its `Part` alone."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class OwnLinks:
     """`consat.protocols.Links` of one agent.
 
     Attributes:
-        row: (E,) the copy at each end.
+        row: (E,) row of the copy at each end.
         groups: groups the ends by copy.
-        degree: (rows,).
-        metropolis: (E,).
+        degree: (rows,) see `Links.degree`.
+        metropolis: (E,) see `Links.metropolis`.
     """
 
     row: Array
@@ -40,7 +40,7 @@ class OwnLinks:
 
     @classmethod
     def of(cls, part: Part) -> OwnLinks:
-        """The ends in the order of `ends`."""
+        """Build from a part; the ends are in the order of `ends`."""
         index = {agent: row for row, agent in enumerate(part.team.ids)}
         known = {neighbour.id: dict(zip(neighbour.shares, neighbour.degrees, strict=True)) for neighbour in part.neighbours}
         pairs = ends(part)
@@ -67,12 +67,12 @@ class OwnLinks:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Alone(LocalSolver):
-    """One agent.
+    """`LocalSolver` of one agent.
 
     Attributes:
-        links: its ends of its links.
-        live: the parameters of its constraints, and how they move.
-        me: its own row.
+        links: the ends of links at the agent.
+        live: changeable parameters of its constraints.
+        me: row of its own position.
     """
 
     links: OwnLinks
@@ -81,8 +81,12 @@ class Alone(LocalSolver):
 
     @classmethod
     def of(cls, part: Part, speaks: str = "link") -> Alone:
-        """The solver of a part; its rows are in the order of `part.team.ids`, and it is agent 0 of one. Speaks: see
-        `consat.protocols.Rounds`."""
+        """Build from a part. Rows are in the order of `part.team.ids`; the agent has index 0 of 1.
+
+        Args:
+            part: the agent's part.
+            speaks: see `consat.protocols.Rounds.speaks`.
+        """
         team = part.team
         me = team.ids.index(part.me)
         return cls(
@@ -104,12 +108,12 @@ class Alone(LocalSolver):
         )
 
     def at(self, time: Array | float) -> Self:
-        """With the constraints as they are at a time, s since t = 0."""
+        """Copy with the constraint parameters at a time, s since t = 0."""
         return self.with_parameters(self.live.at(jnp.asarray(time)))
 
 
 def live_of(part: Part) -> Live:
-    """The parameters of an agent's constraints: arguments of what is compiled, so that nothing compiles when they change."""
+    """Parameters of an agent's constraints. They are arguments of the compiled step, so that a change does not compile."""
     live = Live.of(part.team, 1.0, all_of_them=True)
     assert live is not None
     return live
@@ -122,7 +126,7 @@ def _plan(part: Part, me: int) -> prox.Plan:
 
 
 def _interior(part: Part) -> Interior:
-    """Of the agent as a team of one, whose constraints read its copies; its pairs are in the order of `part.neighbours`."""
+    """Local interior-point step of the agent as a team of one. Its pairs are in the order of `part.neighbours`."""
     team, none = part.team, np.zeros((0, 2), dtype=np.int32)
     number = np.arange(team.count, dtype=np.int32)
     rows = [[*map(team.ids.index, neighbour.travels), *[-1] * neighbour.level] for neighbour in part.neighbours]
@@ -139,5 +143,6 @@ def _interior(part: Part) -> Interior:
 
 
 def ends(part: Part) -> list[tuple[str, str]]:
-    """(neighbour, agent) for each end of a link: over which, and whose position; ordered by position, then by neighbour."""
+    """(neighbour, agent) for each end of a link: the neighbour at the other end, and the owner of the position. Sorted by agent, then by
+    neighbour."""
     return [(neighbour.id, agent) for agent in part.team.ids for neighbour in part.neighbours if agent in neighbour.shares]

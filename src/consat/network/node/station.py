@@ -1,4 +1,4 @@
-"""What every mode of talking shares: an agent's core, neighbours, membership, body and log."""
+"""The base of a node in every mode of communication: the agent's core, neighbours, membership, body and log."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.schedule import Schedule
 
 SILENT: Final = 0.5
-"""A neighbour that was not heard for so long, s, counts as down."""
+"""Time without a message, s, after which a neighbour counts as down."""
 REPORT: Final = 0.1
 """Time between two reports, s."""
 
 Knowledge = Literal["satisfied", "infeasible"] | None
-"""What an agent knows of the whole team: that all are satisfied; that they cannot be, proven; or neither."""
+"""What an agent knows about the whole team: all are satisfied; proven infeasible; or neither (None)."""
 Log = Callable[[dict[str, Any]], None]
 
 
 class Station:
-    """One agent, whatever its mode.
+    """One agent on the network, in any mode.
 
     Args:
-        part: the agent's own.
-        core: what it computes.
-        mode: the word for it; agents of another mode are not understood.
-        transport: over which it talks.
-        clock: own, s.
-        incarnation: larger after each restart.
+        part: the agent's part.
+        core: the protocol compiled for the agent.
+        mode: name of the mode; messages of other modes are refused.
+        transport: transport of the messages.
+        clock: the agent's clock, s.
+        incarnation: a number that is larger after each restart of the agent.
         body: sensor and actuator.
-        log: takes events, which are plain data.
-        frames: how many rounds a message carries.
-        stamped: whether it also carries the number of the round.
-        give_up: a neighbour silent for so long has left for good, s.
-        report: time between two reports, s; 0 reports after each turn.
-        wall: Unix time, s; what the agents of a team have in common.
+        log: function that takes events (JSON-serialisable data).
+        frames: number of rounds in a message.
+        stamped: whether a message contains the number of its round.
+        give_up: silence of a neighbour, s, after which it counts as having left for good.
+        report: time between two reports, s; 0 reports after each step.
+        wall: Unix time, s, which the agents of a team share.
     """
 
     def __init__(
@@ -93,18 +93,23 @@ class Station:
         self._gone: frozenset[str] = frozenset()
         self._look: Look | None = None
         self.target: np.ndarray | None = None
-        """(d,) where the body should be, once that is known."""
+        """(d,) target of the body; None before the first step."""
         self.regroup(None, part.first)
 
-    # -- who is there ------------------------------------------------------------------------------------------------------------------
+    # -- membership --------------------------------------------------------------------------------------------------------------------
 
     @property
     def present(self) -> list[str]:
-        """The neighbours that are there."""
+        """Ids of the neighbours that are present."""
         return [neighbour.id for neighbour in self.core.part.neighbours]
 
     def regroup(self, state: Any, first: np.ndarray) -> Any:
-        """Go on among those who are there: the core and the state for them. Nothing changes if nobody has come or gone."""
+        """Rebuild the core for the agents that are present, and transfer the state to it. Nothing changes if the membership is the same.
+
+        Args:
+            state: the present state; None before the start.
+            first: (copies, d) initial estimates of all agents of the part.
+        """
         gone = self.membership.gone
         if gone != self._gone:
             for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
@@ -123,16 +128,16 @@ class Station:
         return state
 
     def among(self, first: np.ndarray) -> np.ndarray:
-        """The rows of `first`, of all agents of the part, that belong to those who are there."""
+        """The rows of `first`, (copies, d), that belong to agents that are present."""
         return first[[agent not in self._gone for agent in self.part.team.ids]]
 
     @property
     def changed(self) -> bool:
-        """Whether somebody has come or gone since the last `regroup`."""
+        """Whether the membership has changed since the last `regroup`."""
         return self.membership.gone != self._gone
 
     def first(self) -> np.ndarray:
-        """(rows, d) first estimates of all agents of the part, its own position as measured."""
+        """(copies, d) initial estimates of all agents of the part, with the measured position for the agent itself."""
         first = self.part.first.copy()
         position = self.body.position()
         if position is not None:
@@ -141,33 +146,40 @@ class Station:
 
     @property
     def estimates(self) -> dict[str, np.ndarray]:
-        """(d,) its newest estimate of each position that it holds."""
+        """The newest estimate, (d,), of each position that the agent holds."""
         return {} if self._look is None else dict(zip(self.core.part.team.ids, self._look.x, strict=True))
 
     @property
     def satisfied(self) -> bool:
-        """Whether it knows that all are."""
+        """Whether the agent knows that all agents are satisfied."""
         return self._known == "satisfied"
 
     @property
     def known(self) -> Knowledge:
-        """What it knows of the team."""
+        """What the agent knows about the team."""
         return self._known
 
     @property
     def settled(self) -> bool:
-        """Whether it knows all that there is to find: that all are satisfied, or that they cannot be and are near the best."""
+        """Whether the agent knows a final result: all are satisfied, or the team is infeasible and near its best margin."""
         return self.satisfied or (self._known == "infeasible" and self._near)
 
-    # -- what constraints it has -------------------------------------------------------------------------------------------------------
+    # -- constraints -------------------------------------------------------------------------------------------------------------------
 
     @float64
     def change(self, state: Any, constraint: str, parameters: Mapping[str, Any]) -> Any:
-        """Go on with other parameters of an own constraint, checked as those of a scenario: the core, and the state for it. Whatever was
-        proven is not so any more.
+        """Change parameters of one of the agent's own constraints, with the checks of a scenario. All proofs become invalid.
+
+        Args:
+            state: the present state; None before the start.
+            constraint: name of the constraint.
+            parameters: new values of its parameters.
+
+        Returns:
+            The state for the changed core.
 
         Raises:
-            InvalidTeam: no such constraint or parameter, or a value that it cannot have; nothing has changed.
+            InvalidTeam: unknown constraint or parameter, or an invalid value; nothing has changed.
         """
         team = self.part.team
         changes = changes_of(team, self.part.me, constraint, parameters)
@@ -187,14 +199,14 @@ class Station:
         return state
 
     def reborn(self, state: Any) -> Any:
-        """The state after neighbours have begun anew since this was last asked: their constraints may be others than before."""
+        """The state, with proofs dropped if a neighbour has restarted since the last call, because its constraints may have changed."""
         before, self._restarts = self._restarts, sum(peer.restarts for peer in self.peers.all.values())
         return state if before == self._restarts else self.core.anew(state)
 
     # -- messages ----------------------------------------------------------------------------------------------------------------------
 
     def hear(self) -> list[Message]:
-        """What came; news of who is there is taken in already."""
+        """The received messages, after an update of the membership with them."""
         messages = self.peers.hear()
         for message in messages:
             if message.kind is not Kind.GOODBYE:
@@ -209,8 +221,15 @@ class Station:
         return messages
 
     def blocks(self, outbox: Rows) -> dict[str, list[np.ndarray]]:
-        """What to tell each neighbour: of the rows that the core says of links, (shares, width + 1), zeros for who is gone, and last who is
-        there; and of those that it says to neighbours its own."""
+        """The arrays to send to each neighbour.
+
+        Args:
+            outbox: messages of the core.
+
+        Returns:
+            For each neighbour [block, letter]. Block: (shares, width + 1), the core's row of each shared position, 0 for absent agents, and
+            in the last column the membership number of each agent. Letter: the core's row for this neighbour, 0 if it is absent.
+        """
         told = {}
         for neighbour, place in self._places.items():
             block = np.zeros((len(place), self.core.width + 1))
@@ -223,12 +242,19 @@ class Station:
         return told
 
     def empty(self) -> tuple[Rows, Rows]:
-        """Nothing has come."""
+        """Inbox and mask of arrival without messages."""
         return self.core.empty()
 
     def sort(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
-        """Put what a neighbour said into the rows of the ends, as far as both know the same agents to be there; and what it said as a whole
-        where they agree on all."""
+        """Write a message into the inbox. Rows of links are used where both ends agree on the membership of the shared agent; the row of
+        the neighbour is used where they agree on all shared agents.
+
+        Args:
+            neighbour: id of the sender.
+            told: [block, letter]; see `blocks`.
+            inbox: rows of the messages; modified.
+            arrived: masks of arrival; modified.
+        """
         block, letter = told
         place, row = self._places[neighbour], self._turn_of.get(neighbour)
         same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
@@ -240,7 +266,7 @@ class Station:
             arrived.pair[row] = True
 
     def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, Look]:
-        """See `Embodied.turn`; a neighbour whose message would spoil the state is not listened to in this turn."""
+        """Compute a step; see `Embodied.turn`. Messages that would make the state NaN or infinite are not used; see `guard`."""
         self._time = moment.time
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
@@ -250,65 +276,65 @@ class Station:
         return done.state, done.outbox, done.look
 
     def greet(self) -> None:
-        """Say that one is there."""
+        """Send a greeting, which contains the membership, to the neighbours."""
         for neighbour in self._listeners():
             self.peers.say(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
     def say(self, arrays: Mapping[str, list[np.ndarray]], to: list[str] | None = None) -> None:
-        """Send the state to all neighbours that are there, or to some."""
+        """Send a state message to all neighbours that are present, or to those in `to`. `arrays`: see `blocks`."""
         for neighbour in self._listeners() if to is None else to:
             self.peers.say(neighbour, Kind.STATE, arrays[neighbour])
 
     def goodbye(self) -> None:
-        """Say that one stops; whoever leaves for good says so in its state before."""
+        """Send a goodbye: the process stops. An agent that leaves for good announces that in earlier messages."""
         for neighbour in self._listeners():
             self.peers.say(neighbour, Kind.GOODBYE, [])
 
     def _listeners(self) -> list[str]:
-        """The neighbours that are there, and those who are not, but speak: they may not know."""
+        """Present neighbours, and absent ones that were heard recently, because they may not know that they count as absent."""
         now = self.clock()
         return [neighbour for neighbour, peer in self.peers.all.items() if neighbour not in self._gone or now - peer.heard < 4 * SILENT]
 
-    # -- time and place --------------------------------------------------------------------------------------------------------------------
+    # -- time and position -----------------------------------------------------------------------------------------------------------------
 
     @property
     def timed(self) -> bool:
-        """Whether it knows what its constraints are now: they do not move, or it knows when t = 0 is."""
+        """Whether the present constraints are known: they do not move, or the time t = 0 is set."""
         return self.epoch is not None or not self.part.team.moves
 
     def now(self) -> float:
-        """By the clock that the team shares, s since t = 0; 0 where nobody has said when that is."""
+        """Time since t = 0, s, by the clock that the team shares; 0 if t = 0 is not set."""
         return 0.0 if self.epoch is None else self._wall() - self.epoch
 
     def delays(self) -> np.ndarray:
-        """(E,) half the round trip to the neighbour of each end, s; 0 before it is known."""
+        """(E,) half the round-trip time to the neighbour at each end, s; 0 before it is known."""
         trips = {neighbour: np.nan_to_num(peer.trip) for neighbour, peer in self.peers.all.items()}
         return np.array([0.5 * trips[neighbour] for neighbour, _ in self.core.ends])
 
     def fresh(self, within: float) -> np.ndarray:
-        """(E,) whether the neighbour of each end was heard within so many s."""
+        """(E,) whether a message of the neighbour at each end arrived within the last `within` s."""
         now = self.clock()
         return np.array([now - self.peers.all[neighbour].heard <= within for neighbour, _ in self.core.ends], dtype=bool)
 
     def place(self) -> np.ndarray:
-        """(d,) where the body is, NaN where that is not known."""
+        """(d,) position of the body; NaN if unknown."""
         position = self.body.position()
         if position is None or not self.body.sensed(self.clock()):
             return np.full(self.part.team.dimension, np.nan)
         return position
 
-    # -- the log ---------------------------------------------------------------------------------------------------------------------------
+    # -- log and reports -------------------------------------------------------------------------------------------------------------------
 
     def log(self, event: str, **details: Any) -> None:
-        """One event."""
+        """Log one event."""
         self._log({"event": event, "id": self.part.me, "t": self.clock(), **details})
 
     def move(self, look: Look, stamp: float) -> None:
-        """Let the body follow the estimate, and tell what there is to tell.
+        """Command the body towards the agent's estimate, record its position, and log what is new.
 
         Args:
-            look: of the last turn.
-            stamp: round or time, of the track.
+            look: result of the last step.
+            stamp: round or time, s, of the recorded position.
         """
         self.target = look.x[self._me()]
         self.body.follow(self.target, self.clock())
@@ -321,8 +347,12 @@ class Station:
             self.report()
 
     def conclude(self, stamp: float, *, lately: bool = True) -> None:
-        """What the agent knows of the team, told if it is news; lately: whether it has heard of the others lately, without which it knows
-        nothing of where they are."""
+        """Update what the agent knows about the team, and log changes.
+
+        Args:
+            stamp: round or time, s, of the event.
+            lately: whether the others were heard recently. If not, the agent does not know where they are.
+        """
         look, before = self._look, (self._known, self._near)
         self._known, self._near = None, False
         if look is not None and lately and look.known > 0:
@@ -338,11 +368,11 @@ class Station:
                 self.log("infeasible", stamp=stamp, near=self._near, bound=look.bound, margin=_number(look.least))
 
     def _me(self) -> int:
-        """The agent's row among those who are there."""
+        """The agent's row among the agents that are present."""
         return self.core.part.team.ids.index(self.part.me)
 
     def watch(self) -> float:
-        """Log who went down or came up, and a report when one is due; when the next is."""
+        """Log which neighbours went down or came up, and a report when one is due. Returns the time of the next report, s."""
         now = self.clock()
         alive = self.peers.alive()
         down = frozenset(
@@ -362,10 +392,10 @@ class Station:
         return self._next_report
 
     def report(self) -> None:
-        """How things stand, and where the body was since the last report.
+        """Log a report, with the positions of the body since the last report.
 
-        `margin` is that of the agent at its `position`, and where it last heard that the others' bodies are; `estimate_margin` at its
-        estimates; `bound` is proven to be at least the best margin that the team can have.
+        `margin` is the agent's margin at its `position` and the last received positions of the others' bodies; `estimate_margin` is its
+        margin at its estimates; `bound` is a proven upper bound on the best margin of the team.
         """
         look, position = self._look, self.body.position()
         margin = estimate_margin = None
@@ -399,12 +429,12 @@ class Station:
 
 
 def _number(value: float) -> float | None:
-    """For JSON, which knows no infinity."""
+    """A float for JSON; None where it is not finite."""
     return value if np.isfinite(value) else None
 
 
 def _expected(shares: int, largest: np.ndarray, letter: Numbers, frames: int, stamped: bool) -> Expected:
-    """What messages of a neighbour hold; the last number of each row tells who is there."""
+    """Expected arrays of a neighbour's messages. The last number of each row is a membership number."""
     frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), letter]
     return {
         Kind.HELLO: [(shares,)],

@@ -1,4 +1,4 @@
-"""An agent's own small problem: the proximal step of admm, the step of the interior point.
+"""Local optimization steps of an agent: the proximal step (`proximal`) and the interior-point step (`interior`).
 
-In: an agent's constraints over its copies, and what its neighbours last said. Out: new copies, and what to tell each neighbour.
+Input: the agent's constraints on its copies and the last messages of its neighbours. Output: new copies and a message for each neighbour.
 """

@@ -1,6 +1,6 @@
-"""An agent's own part of the interior-point protocol: its Newton step, what it tells each neighbour, and the bound that it proves.
+"""Local part of the interior-point protocol: the Newton step of an agent, its messages, and the bound that it proves.
 
-`layout` says which variables an agent has and shares, and sorts agents into batches; `step` computes a round.
+`layout` defines the variables of an agent and the shared ones, and sorts agents into batches; `step` computes a round.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ __all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "U
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Interior:
-    """The interior-point part of some agents: all of a team, or one alone.
+    """Local interior-point step for all agents of a team or for a single agent. P is the number of ends of links (directed pairs).
 
     Attributes:
-        plan: the agents by shape.
-        units: common knowledge.
-        talker: (P,) which of the agents speaks at each end of a link.
-        other: (P,) the other end of the same link; of one agent alone, whose links end elsewhere, nothing.
-        owner: (M,) whose constraint each is, family after family.
-        degree: (N,) how many neighbours each has.
-        level: (P,) whether the level travels over the pair, and with it the least margin.
+        plan: the agents in batches.
+        units: units and region of the team; common knowledge.
+        talker: (P,) the sending agent at each end of a link.
+        other: (P,) index of the other end of the same link; empty for a single agent, whose links end in other processes.
+        owner: (M,) the owner of each constraint, family after family.
+        degree: (N,) number of neighbours of each agent.
+        level: (P,) whether the level, and with it the least margin, is sent over this link.
     """
 
     plan: Plan
@@ -48,7 +48,7 @@ class Interior:
 
     @classmethod
     def of(cls, team: Team, copies: Estimates, size: Scale) -> Interior:
-        """Of a whole team whose copies `route_of` has laid out."""
+        """Build for a whole team whose copies were laid out by `route_of`."""
         shared = Shared.of(copies)
         talker, listener = shared.pairs.astype(np.int64).T
         keys = talker * team.count + listener
@@ -65,7 +65,7 @@ class Interior:
 
     @classmethod
     def alone(cls, team: Team, copies: Estimates, shared: Shared, units: Units) -> Interior:
-        """Of one agent, a team of one, whose links end elsewhere."""
+        """Build for a single agent (a team of one), whose links end in other processes."""
         pairs, constraints = len(shared.pairs), sum(family.size for family in team.families)
         talker, nothing = np.zeros(pairs, dtype=np.int32), np.zeros(0, dtype=np.int32)
         owner = np.zeros(constraints, dtype=np.int32)
@@ -73,17 +73,17 @@ class Interior:
         return cls(plan_of(team, copies, shared), units, *arrays)
 
     def silence(self) -> Mail:
-        """The mail before anything was said; leading axis P."""
+        """Mail before any message was received; leading axis P."""
         p, pairs = self.plan.width, len(self.talker)
         matrix, vector, number = jnp.zeros((pairs, p, p)), jnp.zeros((pairs, p)), jnp.zeros(pairs)
         return Mail(matrix, vector, number - 1.0, number, number - jnp.inf, number, Proof(matrix, vector, number, number - 1.0, number))
 
     def across(self, mail: Mail) -> Mail:
-        """What stands at the other ends."""
+        """The mail at the other end of each link; leading axis P."""
         return jax.tree.map(lambda leaf: pick(leaf, self.other), mail)
 
     def begin(self, x: Array, gains: Gains) -> Memory:
-        """What the agents remember at the start, from first estimates (C, d)."""
+        """Initial state for the initial estimates `x`, (C, d)."""
 
         def start(batch: Batch) -> Memory:
             y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
@@ -92,13 +92,13 @@ class Interior:
         return self._collected([start(batch) for batch in self.plan.batches])
 
     def round(self, memory: Memory, inbox: Mail, margin: Array, gains: Gains) -> tuple[Memory, Mail]:
-        """One round: what the agents remember, and what stands at each end of a link.
+        """Compute one round. Returns the new state and the mail to send over each end of a link.
 
         Args:
-            memory: before.
-            inbox: what was last heard over each end.
-            margin: (N,) ᾱ_i where the bodies are.
-            gains: of the protocol.
+            memory: state before the round.
+            inbox: the mail last received over each end of a link.
+            margin: (N,) ᾱ_i at the positions of the bodies.
+            gains: gains of the protocol.
         """
         units, pairs, inbox = self.units, len(self.talker), self._counted(inbox)
         y, told = _normal(memory.y, units), margin / units.psi
@@ -127,16 +127,16 @@ class Interior:
         return self._collected([each[0] for each in found]), mail
 
     def least(self, inbox: Mail, margin: Array) -> Array:
-        """(N,) the least margin of the team that each agent knows of, given its own, (N,)."""
+        """(N,) the smallest margin of the team that each agent knows of. `margin`: (N,) its own."""
         told = self._counted(inbox).margin * self.units.psi
         return jnp.minimum(margin, jax.ops.segment_min(told, self.talker, len(margin), indices_are_sorted=True))
 
     def _counted(self, inbox: Mail) -> Mail:
-        """With the margins that came along the spanning tree alone: on a loop an old one would go round for ever."""
+        """Keep only the margins received along the spanning tree: around a loop an outdated margin would circulate for ever."""
         return inbox._replace(margin=jnp.where(self.level, inbox.margin, jnp.inf))
 
     def _collected(self, found: list[Memory]) -> Memory:
-        """The answers of all batches, each where it belongs."""
+        """Gather the results of all batches in the order of the team."""
         plan = self.plan
         whole = Memory(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
         agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "multiplier")}
@@ -155,13 +155,13 @@ def _lanes(batch: Batch, units: Units, gains: Gains, exact: bool) -> Lanes:
 
 
 def _out(memory: Memory) -> Memory:
-    """The agents first: (n·A, d), (m·A,), (A,)."""
+    """Flatten the arrays of a batch: y to (n·A, d), multiplier to (m·A,); per-agent arrays stay (A,)."""
     y = jnp.moveaxis(memory.y, -1, 1)
     return memory._replace(y=y.reshape(-1, y.shape[-1]), multiplier=memory.multiplier.reshape(-1))
 
 
 def _widened(leaf: Array, width: int) -> Array:
-    """(g, p, …, A) → (g·A, width, …)."""
+    """(g, p, …, A) → (g·A, width, …), padded with zeros."""
     leaf = jnp.moveaxis(leaf, -1, 1)
     leaf = leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
     return jnp.pad(leaf, [(0, 0), *[(0, width - size) for size in leaf.shape[1:]]])

@@ -1,4 +1,4 @@
-"""Linear algebra of many small symmetric systems at once; the systems are the last axis of every array, the lanes."""
+"""Linear algebra for many small symmetric systems at once. The last axis of every array is the index of the system (the lane)."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import jax.numpy as jnp
 from jax import Array
 
 LOOPED = 16
-"""Systems of up to so many unknowns are eliminated by a loop over the pivots, larger ones by halves."""
+"""Largest number of unknowns for elimination by a loop over the pivots; larger systems are split into halves recursively."""
 
 
 def product(left: Array, right: Array) -> Array:
-    """(i, k, A), (k, j, A) → (i, j, A)."""
+    """Matrix product in every lane: (i, k, A), (k, j, A) → (i, j, A)."""
     found = jnp.matmul(jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0))
     return jnp.moveaxis(found, 0, -1)
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """(N, N, A), (N, A) → (N, A)."""
+    """Matrix-vector product in every lane: (N, N, A), (N, A) → (N, A)."""
     return jnp.sum(matrix * vector[None], axis=1)
 
 
 def gram(weight: Array, vectors: Array) -> Array:
-    """(N, N, A) Σ_k w_k v_k v_kᵀ from (m, A) and (m, N, A)."""
+    """(N, N, A) Σ_k w_k v_k v_kᵀ. `weight`: (m, A) w_k; `vectors`: (m, N, A) v_k."""
     weighted = weight[:, None] * vectors
     if vectors.size * vectors.shape[1] <= 2**22:
         return jnp.sum(weighted[:, :, None] * vectors[:, None], axis=0)
@@ -34,14 +34,14 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
     """Solve a symmetric positive definite system in every lane.
 
     Args:
-        matrix: (N, N, A).
-        right: (N, r, A).
+        matrix: (N, N, A) matrices.
+        right: (N, r, A) right-hand sides.
 
     Returns:
         (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
     """
     size = len(matrix)
-    if size > LOOPED:  # by halves
+    if size > LOOPED:  # block elimination with two halves
         half = size // 2
         corner = jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
         found, first = solve(matrix[:half, :half], corner)
@@ -64,13 +64,13 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Array, Array]:
-    """Add up the neighbours' quadratics over an agent's own variables.
+    """Sum of the neighbours' quadratics over an agent's own variables.
 
     Args:
-        matrix: (g, p, p, A) of the neighbours.
-        vector: (g, p, A) of the neighbours.
-        shared: (g, p, A) which of the own variables these are; N and more: none.
-        size: N.
+        matrix: (g, p, p, A) matrices of the g neighbours.
+        vector: (g, p, A) vectors of the neighbours.
+        shared: (g, p, A) index of each shared variable among the agent's own; N and more mark padding.
+        size: N, the number of own variables.
 
     Returns:
         (N, N, A) and (N, A).
@@ -81,16 +81,16 @@ def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Arra
 
 
 def reduced(matrix: Array, vector: Array, shared: Array) -> tuple[Array, Array, Array, Array]:
-    """Minimise ½ yᵀMy − hᵀy over all variables but those shared with a neighbour, for each neighbour (a Schur complement).
+    """Minimise ½ yᵀMy − hᵀy over all variables that are not shared with a neighbour, for each neighbour (a Schur complement).
 
     Args:
         matrix: (N, N, A) M.
         vector: (N, A) h.
-        shared: (g, p, A) the variables that stay; N and more: none.
+        shared: (g, p, A) indices of the shared variables, which are kept; N and more mark padding.
 
     Returns:
-        (g, p, p, A) and (g, p, A) the quadratic that is left, (g, A) how much the minimum is below zero, and (g, A) whether M is positive
-        definite on what is eliminated.
+        (g, p, p, A) and (g, p, A) the remaining quadratic, (g, A) minus the minimum over the eliminated variables where the shared ones
+        are 0, and (g, A) whether M is positive definite on the eliminated variables.
     """
     size, count = vector.shape
     g, p, _ = shared.shape

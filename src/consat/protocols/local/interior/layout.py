@@ -1,8 +1,8 @@
-"""Which variables an agent has in the interior-point protocol, and which of them it shares with which neighbour.
+"""Variables of an agent in the interior-point protocol, and the variables that it shares with each neighbour.
 
-An agent's variables are the positions of which it holds copies, and its level. A position travels along a tree: its holders, joined by
-links between them. The level travels along a spanning tree of each cluster. So what comes from a neighbour about a variable never comes
-back to it through others, unless several variables go round a loop together; where all links in use form a tree, nothing does.
+An agent's variables are the positions of which it holds copies, and its level. Each position is exchanged along a tree that spans its
+holders. The level is exchanged along a spanning tree of each cluster. So information about a single variable never returns to its sender
+through other agents. Several variables together can still form a loop; where all used links form a tree, they cannot.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 
 Route = Literal["tree", "links"]
-"""Along what copies travel: along one spanning tree, or along the links themselves, each position along a tree of its own."""
+"""How copies are exchanged: ``tree``, all along one spanning tree, or ``links``, over all links, each position along a tree of its own."""
 
 Vectors = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
 class Form:
-    """What is known beforehand of the constraints of one family.
+    """Static properties of the constraints of one family.
 
     Attributes:
-        psi: the function.
-        curvature: (R, arity·d) vectors v with Σ v vᵀ = the convex part of −∇²ψ for weight 1; None where that varies with the position.
+        psi: the function ψ.
+        curvature: (R, arity·d) vectors v with Σ v vᵀ = the convex part of −∇²ψ for weight 1; None where it varies with the position.
         concave: whether ψ is proven concave.
         quadratic: whether it is a polynomial of degree ≤ 2.
     """
@@ -49,11 +49,11 @@ class Form:
 
 
 class Kind(NamedTuple):
-    """The constraints of one family in a batch: m an agent, padded; leading axis the chunks, last axis the agents of a chunk.
+    """The constraints of one family in a batch, m for each agent with padding. The first axis is the chunk, the last the agent in it.
 
     Attributes:
         slots: (chunks, m, arity, A) which of the agent's copies each constraint reads.
-        parameters: (chunks, m, …, A).
+        parameters: name to (chunks, m, …, A).
         weight: (chunks, m, A).
         used: (chunks, m, A) false where padded.
     """
@@ -67,17 +67,17 @@ class Kind(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """Agents of like shape: up to n copies, m constraints, g neighbours and p variables shared with a neighbour.
+    """Agents of similar size: up to n copies, m constraints, g neighbours and p variables shared with a neighbour.
 
     Attributes:
-        agents: (chunks, A) which; the last is repeated where a chunk is not full.
-        rows: (chunks, n, A) the rows of their copies, their own first; padded past the last row.
-        members: (chunks, m, A) places of their constraints among the multipliers; padded past the last.
-        pairs: (chunks, g, A) their ends of links to neighbours; padded past the last.
-        shared: (chunks, g, p, A) which of their variables they share with each, the level being number n·d; padded with n·d + 1.
-        kinds: their constraints, a family each.
-        forms: what is known of these beforehand.
-        families: which family of the team each kind is, and the place among the multipliers at which this begins.
+        agents: (chunks, A) indices of the agents; the last is repeated where a chunk is not full.
+        rows: (chunks, n, A) rows of their copies, their own first; padded with the number of rows.
+        members: (chunks, m, A) indices of their constraints among the multipliers; padded with the number of multipliers.
+        pairs: (chunks, g, A) indices of their ends of links; padded with the number of ends.
+        shared: (chunks, g, p, A) indices of the variables shared with each neighbour; the level is number n·d; padded with n·d + 1.
+        kinds: their constraints, one entry per family.
+        forms: static properties of these families.
+        families: for each kind the index of its family in the team, and of its first multiplier.
     """
 
     agents: Array
@@ -90,7 +90,7 @@ class Batch:
     families: tuple[tuple[int, int], ...] = field(metadata={"static": True})
 
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Batch:
-        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        """Copy with new constraint parameters. `values`: for each family the parameters to replace, (M_f, …)."""
         kinds, start = [], 0
         for kind, (family, offset) in zip(self.kinds, self.families, strict=True):
             m = kind.used.shape[1]
@@ -104,18 +104,18 @@ class Batch:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Plan:
-    """All agents in batches, and where the answers of each stand among those of all batches, one after the other.
+    """All agents in batches. The index arrays locate each result in the concatenated results of all batches.
 
     Attributes:
         batches: the agents.
-        row: (C,) of each copy.
-        agent: (N,) of each agent.
-        member: (M,) of each constraint, family after family.
-        pair: (P,) of each end of a link.
-        floats: (P,) how many numbers a message over each end holds.
-        width: variables that two neighbours share, at most.
-        exact: whether what agents share travels along trees, so that nothing that one has said comes back to it through others, and no
-            constraint moves: then what they tell adds up to a proof.
+        row: (C,) index of the result for each copy.
+        agent: (N,) index of the result for each agent.
+        member: (M,) index of the result for each constraint, family after family.
+        pair: (P,) index of the result for each end of a link.
+        floats: (P,) number of floats in a message over each end of a link.
+        width: largest number of scalar variables that two neighbours share.
+        exact: whether the agents can prove a bound: all used links form a tree, so that no information returns to its sender through
+            others, and no constraint moves.
     """
 
     batches: tuple[Batch, ...]
@@ -128,19 +128,19 @@ class Plan:
     exact: bool = field(metadata={"static": True})
 
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Plan:
-        """The same with other parameters; of each family those that are given, (M_f, …)."""
+        """Copy with new constraint parameters. `values`: for each family the parameters to replace, (M_f, …)."""
         return replace(self, batches=tuple(batch.with_parameters(values) for batch in self.batches))
 
 
 @dataclass(frozen=True)
 class Shared:
-    """The variables that neighbours share.
+    """The variables that neighbours share, S in all.
 
     Attributes:
         pairs: (P, 2) directed pairs (agent, neighbour), sorted.
-        pair: (S,) which pair, in order, …
-        row: (S,) … shares which of the agent's rows, in the order of positions; −1 for the level, which comes last.
-        exact: see `Plan`.
+        pair: (S,) index of the pair that shares each variable, sorted.
+        row: (S,) the agent's row of the shared variable, sorted by position within a pair; −1 for the level, which comes last.
+        exact: whether all used links form a tree; see `Plan.exact`.
     """
 
     pairs: np.ndarray
@@ -150,7 +150,7 @@ class Shared:
 
     @classmethod
     def of(cls, copies: Estimates) -> Shared:
-        """What the agents with these copies share."""
+        """Compute the shared variables of agents with these copies."""
         count = len(copies.own)
         here, there = _tree(copies.count, copies.edges, copies.own)
         talk = copies.holder[copies.edges].astype(np.int64)
@@ -173,13 +173,19 @@ class Shared:
         return found
 
     def sizes(self, dimension: int) -> np.ndarray:
-        """(P,) how many numbers the shared variables of each pair are."""
+        """(P,) number of scalar variables that each pair shares. `dimension`: d."""
         width = np.where(self.row < 0, 1, dimension)
         return np.bincount(self.pair, weights=width, minlength=len(self.pairs)).astype(np.int64)
 
 
 def _tree(rows: int, edges: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of edges between copies of the same position, both ways, those of a tree that spans them, found breadth first from the owner."""
+    """Edges of trees that span the copies of each position, in both directions, found by breadth-first search from the owner.
+
+    Args:
+        rows: number of copies.
+        edges: (E, 2) edges between copies of the same position, in both directions.
+        own: (N,) rows of own positions.
+    """
     root = np.full(len(own), rows)
     here, there = np.concatenate([edges[:, 0], root, own]), np.concatenate([edges[:, 1], own, root])
     graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(rows + 1, rows + 1)).tocsr()
@@ -191,7 +197,12 @@ def _tree(rows: int, edges: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np
 
 
 def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
-    """(L', 2) the links of a breadth-first spanning tree of every component, from a middle agent of it."""
+    """(L', 2) links of a breadth-first spanning tree of every component, rooted at a central agent.
+
+    Args:
+        count: number of agents N.
+        links: (L, 2).
+    """
     middle = middles(count, links)
     here = np.concatenate([links[:, 0], links[:, 1], np.full(len(middle), count)])
     there = np.concatenate([links[:, 1], links[:, 0], middle])
@@ -204,23 +215,23 @@ def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
 
 
 def _tree_links(copies: Estimates) -> int:
-    """How many links the clusters have where these are trees."""
+    """Number of links if every cluster is a tree."""
     return len(copies.own) - 1 - int(copies.cluster.max(initial=-1))
 
 
 WIDE = 64
-"""Copies travel along a spanning tree while no message holds more than so many shared numbers. Measured on one core: 57 numbers and 50
-agents take 57 ms a round, 65 numbers and 100 agents 95 ms; along the links, 10 ms and 34 ms."""
+"""Largest number of shared scalars per pair for which a spanning tree is used. Measured on one core: a round with 57 scalars and 50 agents
+takes 57 ms, with 65 scalars and 100 agents 95 ms; over the links 10 ms and 34 ms."""
 
 
 class Way(NamedTuple):
-    """Along what the copies of a team travel.
+    """How the copies of a team are exchanged.
 
     Attributes:
-        route: along one spanning tree, or along the links.
-        copies: who holds what then.
-        why: this route was taken.
-        then: who holds what along a spanning tree, to which a team over its links goes over if they do not satisfy it; None if it has none.
+        route: along one spanning tree, or over the links.
+        copies: layout of the copies on this route.
+        why: reason for this route.
+        then: layout along a spanning tree, to which a team on route ``links`` switches if it is not satisfied in time; None without one.
     """
 
     route: Route
@@ -230,13 +241,13 @@ class Way(NamedTuple):
 
 
 def route_of(team: Team, layout: Literal["full", "local"], *, exact: bool = True) -> Way:
-    """Along what the copies of a team travel. Along a tree steps are exact and the team proves its bound; along the links of a team with
-    loops a formation that satisfies everybody is found in fewer rounds, but the least violation often is not found, and never proven.
+    """Choose how the copies of a team are exchanged. Along a tree the steps are exact and the team proves its bound. Over links with loops
+    a satisfying formation is found in fewer rounds, but the smallest violation is often not found and never proven.
 
     Args:
-        team: whose clusters are connected.
-        layout: of the estimates.
-        exact: whether to take a spanning tree from the start where there are loops, if it is narrow enough.
+        team: team with connected clusters.
+        layout: layout of the estimates.
+        exact: whether to use a spanning tree from the start where the links form loops, if no pair shares more than `WIDE` scalars on it.
     """
     along_links = Estimates.of(team, layout)
     if len(along_links.links) == _tree_links(along_links):
@@ -254,10 +265,12 @@ def route_of(team: Team, layout: Literal["full", "local"], *, exact: bool = True
 
 
 ALIKE = 2**19
-"""Agents make one batch, padded to a common shape, while the matrices of all hold at most so many numbers; else one for each size."""
+"""Largest number of matrix entries for which all agents are padded to one batch; beyond, there is one batch for each size class."""
 
 
 class _Group(NamedTuple):
+    """Agents of one batch, and the padded sizes n, g and p; see `Batch`."""
+
     agents: np.ndarray
     n: int
     g: int
@@ -265,7 +278,13 @@ class _Group(NamedTuple):
 
 
 def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
-    """Sort the agents of a team into batches of like shape."""
+    """Sort the agents of a team into batches of similar size.
+
+    Args:
+        team: the team.
+        copies: the layout of estimates.
+        shared: the variables that neighbours share.
+    """
     count, d = team.count, team.dimension
     first = np.searchsorted(copies.holder, np.arange(count + 1))
     held = np.diff(first)
@@ -273,12 +292,12 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     size = shared.sizes(d)
     widest = np.ones(count, dtype=np.int64)
     np.maximum.at(widest, shared.pairs[:, 0], size)
-    power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # up to 8, 32, 128, …
+    power = np.ceil(np.log2(np.maximum(np.maximum(held, degree), 8) / 8) / 2).astype(int)  # size classes up to 8, 32, 128, …
     if count * max(degree.max(initial=0), 1) * (held.max(initial=0) * d + 1) ** 2 <= ALIKE:
         power[:] = 0
     forms = [form_of(family, d) for family in team.families]
     start = np.cumsum([0, *(family.size for family in team.families)])
-    slot = np.arange(copies.count) - first[copies.holder]  # the own copy first, the others in order
+    slot = np.arange(copies.count) - first[copies.holder]  # the own copy first, the others sorted by position
     mine = slot[copies.own]
     slot = np.where(slot == mine[copies.holder], 0, slot + (slot < mine[copies.holder]))
     made = [
@@ -297,7 +316,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
             offset += flat.size
         where[name] = on_device(place)
     places = size - np.bincount(shared.pair, weights=shared.row < 0, minlength=len(shared.pairs)).astype(np.int64)
-    # a quadratic with barrier, level, margin and a count of changes, and a proof with its constant, weight and error
+    # quadratic + (barrier, level, margin, changes), and proof quadratic + (constant, weight, error)
     floats = size * (size + 3) // 2 + 4 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
@@ -361,7 +380,7 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
 
 
 def form_of(family: Family, dimension: int) -> Form:
-    """What is known beforehand of the constraints of a family."""
+    """Static properties of the constraints of a family. `dimension`: d."""
     from consat.problem.constraints.curvature import Curvature, read_curvatures
 
     readings = read_curvatures(family.psi, family.arity, dimension, family.lasting, family.size)

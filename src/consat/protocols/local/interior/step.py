@@ -1,8 +1,8 @@
-"""One round of the interior-point protocol for the agents of a batch. The agents are the last axis of every array, the lanes.
+"""One round of the interior-point protocol for the agents of a batch. The last axis of every array is the agent (the lane), size A.
 
-Positions are measured from the middle of the team's region in the team's unit of length, and ψ in the team's unit of ψ, so that a team in
-millimetres and the same team in kilometres take the same rounds. The variables of an agent are its n·d coordinates and, last, its level.
-Its constraints are followed by one more, the cap: the level is at most what the team asks for.
+Units: positions are relative to the centre of the team's region, in the team's unit of length; ψ is in the team's unit of ψ. So a team in
+millimetres and the same team in kilometres take the same number of rounds. The variables of an agent are its n·d coordinates, then its
+level. The last constraint of every agent is the cap: the level is at most `cap`.
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ from consat.protocols.local.interior.algebra import gram, reduced, solve, spread
 from consat.protocols.local.interior.layout import Batch, Kind
 
 NUDGE = 1e-3
-"""Copies begin by this part of the way from the own place to the first estimate, so that no two fall together."""
+"""Copies start at this fraction of the way from the agent's own position to the initial estimate, so that no two copies coincide."""
 WIDER = 0.5
-"""The same where a ψ is not quadratic: where places coincide norms have a kink, and inverse distances a pole, that one leaves slowly."""
+"""`NUDGE` for agents with a ψ that is not quadratic. Near coinciding positions norms have a kink and inverse distances a pole, which the
+steps leave slowly."""
 TRIES = 24
-"""Places that are tried, ever farther away, where a ψ is not a number at the start."""
+"""Number of starting positions tried, at growing distance, while a ψ is not finite."""
 SHORTEST = 1e-9
-"""A step of which no part as long as this is allowed is not taken."""
+"""Smallest step length of the line search; below it the step is not taken."""
 NEAR = 1e-3
-"""The least slack at the start, in units of ψ."""
+"""Smallest initial slack, in units of ψ."""
 BACK, RAISE, EASE, HEAVIEST = 0.3, 2.0, 0.7, 10.0
-"""An agent that steps back by this part of its last step raises its inertia by a factor, and eases it by another where not, between once
-and so many times that of the protocol."""
+"""Adaptive inertia. An agent that steps back by more than `BACK` of its last step multiplies its inertia by `RAISE`, else by `EASE`. The
+result stays between 1 and `HEAVIEST` times the gain `inertia` of the protocol."""
 GAP = 1e-2
-"""Levels that differ by less need not come down at once, in units of ψ."""
+"""Difference of levels, in units of ψ, below which a level is not lowered at once."""
 
 
 class Units(NamedTuple):
-    """Common knowledge.
+    """Units and region of the team; common knowledge. Scalars have shape ().
 
     Attributes:
-        center: (d,) the middle of the team's region, length.
+        center: (d,) centre of the team's region, in the scenario's length.
         length: the team's unit of length.
         psi: the team's unit of ψ.
-        reach: how far the region reaches, in units of length.
-        extent: how far beyond it constraints may lead, in units of length.
+        reach: half width of the region on each axis, in units of `length`.
+        extent: distance beyond the region to which constraints may lead, in units of `length`.
     """
 
     center: Array
@@ -55,7 +56,7 @@ class Units(NamedTuple):
 
     @classmethod
     def of(cls, size: Scale) -> Units:
-        """From the natural size of a team."""
+        """From the natural scale of a team."""
         return cls(
             on_device(size.center),
             on_device(size.length),
@@ -66,20 +67,20 @@ class Units(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What an agent remembers; leading axes as here, then the agents.
+    """State of the interior-point step. Shapes are for one agent; inside a batch the last axis is the agent.
 
     Attributes:
-        y: (n, d) its copies.
+        y: (n, d) copies.
         multiplier: (m,) λ_ik; 0 where padded.
         lid: λ of the cap.
         level: t_i.
         barrier: μ_i.
-        bound: the least proven bound on the best margin so far.
+        bound: smallest proven bound on the best margin so far.
         age: rounds since the start.
-        inertia: κ_i, as a multiple of the protocol's.
-        swing: the last step, along a direction that stays the same.
-        warm: rounds left in which it maximises the mean of its margins.
-        changes: the largest count of changed constraints, its own or heard of: proofs speak of the constraints that it counts.
+        inertia: κ_i, as a multiple of the gain `inertia`.
+        swing: component of the last step along a fixed direction, to detect oscillation.
+        warm: remaining rounds in which the mean of the margins is maximised.
+        changes: largest known number of constraint changes, own or received. A proof is valid only for constraints with the same number.
     """
 
     y: Array
@@ -96,14 +97,14 @@ class Memory(NamedTuple):
 
 
 class Proof(NamedTuple):
-    """c + eᵀz − ½ zᵀLz, an upper bound on Σ λψ over all behind the sender, maximised over what the receiver does not share.
+    """Upper bound c + eᵀz − ½ zᵀLz on Σ λψ over all agents behind the sender, maximised over the variables not shared with the receiver.
 
     Attributes:
-        matrix: (g, p, p) L; nothing of the level.
+        matrix: (g, p, p) L; 0 for the level.
         vector: (g, p) e.
         constant: (g,) c.
         weight: (g,) Σ λ; negative where there is no proof.
-        error: (g,) what rounding may have taken off c.
+        error: (g,) bound on the rounding error of c.
     """
 
     matrix: Array
@@ -114,16 +115,16 @@ class Proof(NamedTuple):
 
 
 class Mail(NamedTuple):
-    """What an agent tells each neighbour, or has last heard from it; (g, …), then the agents.
+    """Message to each of g neighbours, or the last message from each. Inside a batch a last axis, the agent, follows.
 
     Attributes:
-        matrix: (g, p, p) L of the quadratic ½ zᵀLz − eᵀz in the shared variables z: all that it knows otherwise.
+        matrix: (g, p, p) L of the quadratic ½ zᵀLz − eᵀz in the shared variables z. It summarises all that the sender knows from elsewhere.
         vector: (g, p) e.
-        barrier: (g,) μ; negative where nothing is said of the level.
+        barrier: (g,) μ; negative where the message says nothing about the level.
         level: (g,) t.
-        margin: (g,) the least margin of all behind the sender.
-        changes: (g,) the sender's count of changes; see `Memory`.
-        proof: see there.
+        margin: (g,) smallest margin of all agents behind the sender.
+        changes: (g,) the sender's `Memory.changes`.
+        proof: see `Proof`.
     """
 
     matrix: Array
@@ -137,7 +138,7 @@ class Mail(NamedTuple):
 
 @dataclass(frozen=True)
 class Gains:
-    """See `consat.protocols.interior_point.InteriorPoint`."""
+    """Gains of the step; see `consat.protocols.interior_point.InteriorPoint`."""
 
     cap: float | None
     inertia: float
@@ -153,15 +154,15 @@ class Gains:
 
 @dataclass(frozen=True)
 class Lanes:
-    """The constraints of the agents of a chunk; m below counts the cap.
+    """The constraints of the agents of one chunk; m below includes the cap.
 
     Attributes:
-        batch: what is known of them; its arrays are not used.
-        kinds: their constraints, without the axis of chunks.
-        units: see there.
-        cap: what the level need not exceed, in units of ψ; None without a cap.
+        batch: static properties of the agents; its arrays are not used.
+        kinds: the constraints, without the axis of chunks.
+        units: see `Units`.
+        cap: upper bound on the level, in units of ψ; None without a cap.
         shape: (n, d, A).
-        exact: whether proofs can be told: see `Plan`.
+        exact: whether bounds can be proven; see `Plan.exact`.
     """
 
     batch: Batch
@@ -173,23 +174,23 @@ class Lanes:
 
     @property
     def quadratic(self) -> Array:
-        """(A,) whether all of an agent's ψ are."""
+        """(A,) whether all ψ of an agent are quadratic."""
         others = [kind.used.any(axis=0) for form, kind in self._each() if not form.quadratic]
         return ~jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *others]), axis=0)
 
     @property
     def used(self) -> Array:
-        """(m, A) where there is a constraint."""
+        """(m, A) false where padded."""
         own = jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *(kind.used for kind in self.kinds)])
         return jnp.concatenate([own, own.any(axis=0, keepdims=True) & (self.cap is not None)])
 
     def psi(self, y: Array) -> Array:
-        """(m, A) ψ at copies (n, d, A), the cap last; −∞ outside its domain, +∞ where padded."""
+        """(m, A) ψ at the copies `y`, (n, d, A), the cap last; −∞ outside the domain of ψ, +∞ where padded."""
         own = [self._masked(kind, _along(_at(form.psi))(self._arguments(kind, y), kind.parameters)) for form, kind in self._each()]
         return self._with_cap(own)
 
     def slopes(self, y: Array) -> tuple[Array, Array]:
-        """(m, A) ψ and (m, n·d, A) ∇ψ; 0 where that is not finite."""
+        """(m, A) ψ and (m, n·d, A) ∇ψ at the copies `y`, (n, d, A); entries of ∇ψ that are not finite are 0."""
         values, gradients = [], []
         for form, kind in self._each():
             value, found = _along(jax.value_and_grad(_at(form.psi)))(self._arguments(kind, y), kind.parameters)
@@ -200,11 +201,14 @@ class Lanes:
         return self._with_cap(values), jnp.concatenate([*gradients, jnp.zeros((1, n * d, count))])
 
     def bends(self, y: Array, quadratic: bool = False) -> tuple[Array, Array, Array]:
-        """(r,) which constraint, (r, A) weights and (r, n·d, A) vectors: Σ w λ v vᵀ is the convex part of −Σ_k λ_k ∇²ψ_k.
+        """Curvature of the constraints as r rank-one terms: Σ w λ v vᵀ is the convex part of −Σ_k λ_k ∇²ψ_k.
 
         Args:
-            y: (n, d, A).
-            quadratic: whether only of those ψ that are quadratic, whose curvature at one point is that everywhere.
+            y: (n, d, A) copies.
+            quadratic: whether to include only quadratic ψ, whose curvature is the same everywhere.
+
+        Returns:
+            (r,) the constraint of each term, (r, A) weights w, and (r, n·d, A) vectors v.
         """
         n, d, count = self.shape
         which, weights, vectors, done = [], [jnp.zeros((0, count))], [jnp.zeros((0, n * d, count))], 0
@@ -239,31 +243,32 @@ class Lanes:
         return jnp.where(kind.used, value, jnp.inf)
 
     def _arguments(self, kind: Kind, y: Array) -> Array:
-        """(m, arity, d, A) the positions that each ψ takes."""
+        """(m, arity, d, A) the arguments of each ψ, in the scenario's units."""
         x = self.units.center[None, :, None] + self.units.length * y
         m, arity, count = kind.slots.shape
         found = jnp.take_along_axis(x, kind.slots.reshape(m * arity, 1, count), axis=0)
         return found.reshape(m, arity, self.shape[1], count)
 
     def _placed(self, kind: Kind, slope: Array) -> Array:
-        """(m, arity, d, A) → (m, n·d, A): on the copies that each constraint reads."""
+        """(m, arity, d, A) → (m, n·d, A): from the arguments of each constraint to the agent's coordinates."""
         n, d, count = self.shape
         where = jnp.arange(n, dtype=jnp.int32)[None, None, :, None] == kind.slots[:, :, None]  # (m, arity, n, A)
         return jnp.sum(jnp.where(where[:, :, :, None], slope[:, :, None], 0.0), axis=1).reshape(len(slope), n * d, count)
 
 
 def _at(psi: Any) -> Any:
-    """ψ of (arity, d) positions and its parameters."""
+    """ψ as a function of an array of positions, (arity, d), and a dictionary of parameters."""
     return lambda x, p: psi(*x, **p)
 
 
 def _along(function: Any) -> Any:
-    """A function of one constraint of one agent, for all of both: (m, …, A)."""
+    """Vectorise a function of one constraint of one agent over the constraints (first axis) and the agents (last axis)."""
     return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1))
 
 
 def _bend(psi: Any, arity: int, d: int) -> Any:
-    """Eigenvalues of −∇²ψ, the negative ones as 0, (R,), and eigenvectors, (R, arity, d), of (arity, d) positions and parameters."""
+    """Function of positions, (arity, d), and parameters that returns the eigenvalues of −∇²ψ, clipped at 0, (R,), and the eigenvectors,
+    (R, arity, d)."""
 
     def one(x: Array, p: dict[str, Array]) -> tuple[Array, Array]:
         hessian = -jax.hessian(_at(psi))(x, p).reshape(arity * d, arity * d)
@@ -274,10 +279,10 @@ def _bend(psi: Any, arity: int, d: int) -> Any:
 
 
 class Here(NamedTuple):
-    """The constraints of an agent at its copies.
+    """Values and derivatives of the constraints at the copies.
 
     Attributes:
-        psi: (m, A).
+        psi: (m, A) ψ.
         slopes: (m, n·d, A) ∇ψ.
         bends: see `Lanes.bends`.
     """
@@ -292,12 +297,12 @@ class Here(NamedTuple):
 
 
 def begin(lanes: Lanes, y: Array, gains: Gains) -> Memory:
-    """What an agent begins with: every copy near its own place, and the level below its margin there.
+    """Initial state: every copy near the agent's own position, and the level below its margin there.
 
     Args:
-        lanes: its constraints.
-        y: (n, d, A) first estimates, its own first.
-        gains: of the protocol.
+        lanes: the agents' constraints.
+        y: (n, d, A) initial estimates, the own position first.
+        gains: gains of the protocol.
     """
     y = placed(lanes, y)
     psi = lanes.psi(y)
@@ -309,8 +314,8 @@ def begin(lanes: Lanes, y: Array, gains: Gains) -> Memory:
 
 
 def placed(lanes: Lanes, y: Array) -> Array:
-    """(n, d, A) where an agent's copies begin: near its own place; where one of its ψ is not a number there, at its first estimates, and
-    failing that at the nearest of `TRIES` places around those at which it is one."""
+    """(n, d, A) initial copies: near the agent's own position. Where a ψ is not finite there, the initial estimates `y` are used. Where a ψ
+    is not finite at these either, the nearest of `TRIES` pseudo-random points around them at which all ψ are finite is used."""
     near = y[:1] + jnp.where(lanes.quadratic, NUDGE, WIDER)[None, None] * (y - y[:1])
 
     def wrong(y: Array) -> Array:
@@ -329,7 +334,11 @@ def placed(lanes: Lanes, y: Array) -> Array:
 
 
 def centered(lanes: Lanes, psi: Array) -> tuple[Array, Array, Array, Array]:
-    """(m − 1, A) λ, (A,) λ of the cap, level and barrier: on the central path, of a level well below the margin."""
+    """Multipliers, level and barrier on the central path, for a level well below the margin. `psi`: (m, A).
+
+    Returns:
+        (m − 1, A) λ, (A,) λ of the cap, (A,) level, and (A,) barrier.
+    """
     used = lanes.used & (psi > -jnp.inf)
     margin = jnp.min(jnp.where(used, psi, jnp.inf)[:-1], axis=0, initial=jnp.inf)
     some = jnp.isfinite(margin)
@@ -343,26 +352,29 @@ def centered(lanes: Lanes, psi: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def mean(multiplier: Array, s: Array, used: Array) -> Array:
-    """(A,) the mean of λ s over an agent's constraints."""
+    """(A,) mean of λ s over the used constraints of each agent; all arguments have shape (m, A)."""
     return jnp.sum(jnp.where(used, multiplier * s, 0.0), axis=0) / jnp.maximum(number(used), 1.0)
 
 
 def number(mask: Array) -> Array:
-    """(k, A) → (A,) how many."""
+    """(k, A) → (A,) number of true entries."""
     return jnp.sum(mask.astype(float), axis=0)
 
 
 def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *, told: Array, gains: Gains) -> tuple[Memory, Mail]:
-    """A Newton step on own constraints and the neighbours' quadratics, then a quadratic and a proof for each neighbour.
+    """Take one Newton step on the own constraints and the neighbours' quadratics; compute a quadratic and a proof for each neighbour.
 
     Args:
         lanes: the agents' constraints.
-        shared: (g, p, A) which variables each shares with each neighbour.
+        shared: (g, p, A) indices of the variables shared with each neighbour.
         held: (n, A) false where copies are padded.
-        memory: before.
-        inbox: what was last heard.
-        told: (A,) the own margin where the bodies are.
-        gains: of the protocol.
+        memory: state before the step.
+        inbox: the last message of each neighbour.
+        told: (A,) the agent's margin at the positions of the bodies.
+        gains: gains of the protocol.
+
+    Returns:
+        The new state, and the mail to each neighbour.
     """
     n, d, count = memory.y.shape
     size = n * d + 1
@@ -377,9 +389,9 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     multiplier = jnp.concatenate([memory.multiplier, memory.lid[None]])
     warm = memory.warm > 0
 
-    # come down to the lowest level heard; or, if constraints moved, below the margin
+    # lower the level to the lowest level received, or below the margin where constraints have moved
     here = Here.of(lanes, y)
-    used = lanes.used & (here.psi > -jnp.inf)  # what is not a number here has no slope to follow
+    used = lanes.used & (here.psi > -jnp.inf)  # a ψ that is not finite has no usable slope
     margin = jnp.min(here.psi[:-1], axis=0, initial=jnp.inf, where=used[:-1])
     low = jnp.min(jnp.where(used, here.psi - level[None], jnp.inf), axis=0)
     lower = jnp.where(lowest < level - jnp.maximum(gains.drop * low, GAP), lowest, level)
@@ -390,7 +402,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     barrier = jnp.where(moved, jnp.maximum(barrier, gains.centering * mean(multiplier, s, used) / 3), barrier)
     multiplier = jnp.where(moved[None] & used, jnp.minimum(multiplier, barrier[None] / s), multiplier)
 
-    # Newton
+    # Newton step
     matrix, gradient = model(here, Point(s, multiplier, barrier, used, warm, memory.inertia * gains.inertia), gains)
     flat = jnp.concatenate([y.reshape(n * d, count), level[None]])
     step, _ = solve(matrix + outside, (pull - gradient - times(outside, flat))[:, None])
@@ -407,11 +419,11 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     room = jnp.where(change < 0, gains.boundary * multiplier / jnp.where(change < 0, -change, 1.0), 1.0)
     multiplier = multiplier + jnp.minimum(1.0, jnp.min(room, axis=0))[None] * change
 
-    # where that leads
+    # constraints, multipliers and barrier after the step
     here = Here.of(lanes, y)
     fresh = centered(lanes, here.psi)
     level = jnp.where(warm, fresh[2], level)
-    used = lanes.used & (here.psi > level[None])  # not what has only now become a number
+    used = lanes.used & (here.psi > level[None])  # the slack is negative only where ψ became finite in this step
     margin = jnp.min(here.psi[:-1], axis=0, initial=jnp.inf)
     s = jnp.where(used, here.psi - level[None], 1.0)
     center = barrier[None] / s
@@ -424,14 +436,14 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     barrier = jnp.where(some, jnp.maximum(wanted, jnp.maximum(theirs, apart)), theirs)
     barrier = jnp.where(warm, fresh[3], barrier)
 
-    # what to say
+    # messages
     rest = jnp.maximum(memory.warm - 1.0, 0.0)
     warm = rest > 0
     matrix, gradient = model(here, Point(s, multiplier, barrier, used, warm, inertia * gains.inertia), gains)
     flat = jnp.concatenate([y.reshape(n * d, count), level[None]])
     left, e, _, fine = reduced(matrix + outside, times(matrix, flat) - gradient + pull, shared)
     left, e = left - inbox.matrix, e - inbox.vector
-    if gains.warm:  # nothing is said of the level yet
+    if gains.warm:  # during warm-up messages contain nothing about the level
         places = ((shared < size - 1) | ~warm[None, None]).astype(float)
         left, e = left * places[:, :, None] * places[:, None], e * places
     fine &= jnp.isfinite(left).all(axis=(1, 2)) & jnp.isfinite(e).all(axis=1)
@@ -454,7 +466,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
 
 
 def _least_of_others(numbers: Array) -> Array:
-    """(k, A) → (k, A): for each number the least of the others."""
+    """(k, A) → (k, A): for each entry the smallest of the other entries of its lane."""
     least, at = jnp.min(numbers, axis=0), jnp.argmin(numbers, axis=0)
     mine = jnp.arange(len(numbers), dtype=at.dtype)[:, None] == at[None]
     second = jnp.min(jnp.where(mine, jnp.inf, numbers), axis=0)
@@ -462,15 +474,15 @@ def _least_of_others(numbers: Array) -> Array:
 
 
 class Point(NamedTuple):
-    """Where the barrier problem of an agent stands; m counts the cap.
+    """Current point of the barrier problem; m includes the cap.
 
     Attributes:
-        slack: (m, A) ψ − t.
-        multiplier: (m, A).
-        barrier: (A,).
+        slack: (m, A) s = ψ − t.
+        multiplier: (m, A) λ.
+        barrier: (A,) μ.
         used: (m, A) which constraints count.
         warm: (A,) whether the mean of the margins is maximised.
-        inertia: (A,).
+        inertia: (A,) κ.
     """
 
     slack: Array
@@ -482,7 +494,8 @@ class Point(NamedTuple):
 
 
 def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
-    """(N, N, A) the matrix and (N, A) the gradient of Newton's step; where `warm`, (A,), of the mean of the margins, without a level."""
+    """(N, N, A) matrix M and (N, A) gradient g of the Newton step. Where `point.warm`, they are those of the mean of the margins, and the
+    level is not a variable."""
     s, multiplier, barrier, used, warm, inertia = point
     count = s.shape[-1]
     some = used[:-1].any(axis=0)
@@ -498,7 +511,7 @@ def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
     gradient = -jnp.sum(pressed[:, None] * rows, axis=0)
     gradient = gradient.at[-1].add(jnp.where(some, -1.0, 0.0))
     gradient = gradient.at[-1].set(jnp.where(warm, 0.0, gradient[-1]))
-    trace = jnp.trace(matrix)  # whatever the padding
+    trace = jnp.trace(matrix)  # independent of the padding, whose entries are 0
     still = jnp.where(warm, 1e-6, inertia) + 1e-12 * trace
     own = jnp.where(warm, 1.0, 1e-9 * matrix[-1, -1] + jnp.where(some, 0.0, 1e-9))
     last = jnp.arange(len(matrix))[:, None] == len(matrix) - 1
@@ -506,7 +519,15 @@ def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
 
 
 def longest(lanes: Lanes, flat: Array, step: Array, least: Array, used: Array) -> Array:
-    """(A,) the longest part of a step after which every slack is at least `least`, (m, A), and every ψ of those `used` a number."""
+    """(A,) step length by backtracking: after the step every slack is at least `least` and every used ψ is finite; 0 if none is found.
+
+    Args:
+        lanes: the agents' constraints.
+        flat: (N, A) variables before the step.
+        step: (N, A) full step.
+        least: (m, A) lower bounds on the slacks.
+        used: (m, A) which constraints count.
+    """
 
     def good(scale: Array) -> Array:
         new = flat + scale[None] * step
@@ -523,25 +544,35 @@ def longest(lanes: Lanes, flat: Array, step: Array, least: Array, used: Array) -
 
 
 REGION = 10.0
-"""The region of which a proof speaks, in reaches of the team's places around their middle; and as far as constraints may lead."""
+"""Radius R of the region for which a proof holds, in multiples of the team's reach around its centre; `Units.extent` is added to it."""
 SLACK = 3e-4
-"""What that region may add to the bound at most, in units of ψ; a little more where agents without constraints relay."""
+"""Largest increase of the bound by the restriction to that region, in units of ψ; a little more where agents without constraints relay."""
 IDLE = 0.01
-"""The part of an agent without constraints in that, whose Σ λ is 0."""
+"""Weight that replaces Σ λ = 0 of an agent without constraints in that restriction."""
 
 
 def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, multiplier: Array, inbox: Proof) -> tuple[Proof, Array]:
-    """The proof for each neighbour, and (A,) a bound on the best margin: max_x Σ λψ / Σ λ over all agents (design, section 9).
+    """The proof for each neighbour, and (A,) an upper bound on the best margin: max_x Σ λψ / Σ λ over all agents (design, section 9).
 
-    A ψ that is not quadratic stands in by its tangent, which is above it everywhere if it is concave. So that no direction is flat, every
-    agent adds ε w (R² − ‖x_i‖²), w being its Σλ or `IDLE`, which is not negative in the region of radius R around the team's middle.
+    A ψ that is not quadratic is replaced by its tangent, which is an upper bound on a concave ψ. To make every direction strictly concave,
+    each agent adds ε w (R² − ‖x_i‖²) with w = Σ λ, or w = `IDLE` without constraints. This term is not negative within radius R of the
+    team's centre, so that the bound holds for all formations in that region.
 
-    Rounding is outward. Sums and eliminations of positive definite systems are backward stable: what is computed is exact for a matrix, a
-    vector and a constant whose entries are off by at most `eps` of the terms that were added up in them (Higham, Accuracy and Stability of
-    Numerical Algorithms, sections 10.1 and 14.4). That moves a quadratic at z by at most eps (|c| + |e|ᵀ|z| + ½ |z|ᵀ|L||z|). Every agent
-    adds it for its own terms and for every quadratic that it solves or passes on, with |z| at its estimates and at the maximum that it
-    finds; farther away the quadratic has fallen by more than that. ψ and its slope are off by what rounding a position, as far out as the
-    team's middle, does to them. Beside that, formations within half of R have at least ¾ `SLACK` in hand.
+    Rounding is outward. Sums and eliminations of positive definite systems are backward stable: the computed result is exact for a matrix,
+    a vector and a constant whose entries differ by at most `eps` times the terms summed in them (Higham, Accuracy and Stability of
+    Numerical Algorithms, sections 10.1 and 14.4). This changes a quadratic at z by at most eps (|c| + |e|ᵀ|z| + ½ |z|ᵀ|L||z|). Every agent
+    adds this error for its own terms and for every quadratic that it solves or forwards, with |z| at its estimates and at the maximiser;
+    farther away the quadratic has decreased by more than the error. The error of ψ and ∇ψ is that of rounding a position, whose absolute
+    value includes the team's centre. In addition, formations within R/2 have a reserve of at least ¾ `SLACK`.
+
+    Args:
+        lanes: the agents' constraints.
+        shared: (g, p, A) indices of the variables shared with each neighbour.
+        held: (n, A) false where copies are padded.
+        y: (n, d, A) copies.
+        here: constraints at `y`.
+        multiplier: (m, A) λ, the cap last.
+        inbox: the last proof of each neighbour.
     """
     n, d, count = y.shape
     size, (g, p, _) = n * d, shared.shape
@@ -564,7 +595,7 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
     absent = jnp.repeat(~held, d, axis=0, total_repeat_length=size)
     matrix = matrix + jnp.eye(size)[:, :, None] * (jnp.where(own, 2 * curve[None], 0.0) + absent.astype(float))[:, None]
 
-    places = jnp.where(shared < size, shared, size)  # the level is no variable of the proof
+    places = jnp.where(shared < size, shared, size)  # the level is not a variable of the proof
     outside, pull = spread(inbox.matrix, inbox.vector, places, size)
     neighbour, have = (shared <= size).any(axis=1), inbox.weight >= 0
     missing = number(neighbour & ~have)

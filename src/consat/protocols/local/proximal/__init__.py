@@ -1,13 +1,15 @@
-"""The local proximal step: every agent's own small problem, from any start (design, section 4).
+"""The proximal step of every agent, from any start (design, section 4):
 
     x⁺ = argmin_y  f_i(y) + Σ_r κ_r/2 ‖y_r − v_r‖²,      f_i = e^{L_i},  L_i = −ν_β α_i
 
-over the rows r that the agent's constraints read (the others stay at v). f_i overflows far from satisfaction and its gradient underflows
-near it, so e^{L} is replaced by its conjugate: with ln of the multiplier, σ, as one more unknown, the step is the saddle point
+over the rows r that the agent's constraints read; the other rows are set to v. f_i overflows where constraints are strongly violated, and
+its gradient underflows where they are well satisfied. So e^{L} is replaced by its conjugate, with one more unknown σ, the logarithm of the
+multiplier. The step is the saddle point
 
     κ (y − v) + e^σ ∇L(y) = 0,        L(y) − σ = 0.
 
-`batches` sorts the agents, `lanes` computes L and its derivatives for many at once, `hessians` solves linear systems, `newton` the step.
+Modules: `batches` sorts agents into batches, `lanes` computes L and its derivatives, `hessians` solves the linear systems, and `newton`
+solves the saddle-point equations.
 """
 
 from __future__ import annotations
@@ -30,14 +32,19 @@ __all__ = ["MOST_ITERATIONS", "SMALL_TEAM", "STRONGEST", "Guess", "Memory", "Pla
 
 
 class Memory(NamedTuple):
-    """What the solver of each agent keeps for its next step, (N,): ln of the multiplier, and the sharpness reached."""
+    """Warm start of each agent's solver.
+
+    Attributes:
+        sigma: (N,) σ, logarithm of the multiplier.
+        sharpness: (N,) sharpness of the soft minimum that was reached, in (0, 1].
+    """
 
     sigma: Array
     sharpness: Array
 
 
 def recall(plan: Plan, nu: Nu, x: Array, kappa: Array) -> Memory:
-    """What to remember before the first step from x, (rows, d), at weights κ, (rows,)."""
+    """Initial warm start for the first step from `x`, (rows, d), with weights κ, (rows,)."""
 
     def begin(batch: Batch, part: Part) -> tuple[Array, Array]:
         lanes = Lanes(batch, part.kinds, nu, jnp.zeros(part.rows.shape[-1]))
@@ -51,20 +58,20 @@ def recall(plan: Plan, nu: Nu, x: Array, kappa: Array) -> Memory:
 def step(
     plan: Plan, nu: Nu, v: Array, kappa: Array, x: Array, memory: Memory, *, offset: Array | float, precision: Precision
 ) -> tuple[Array, Memory, Array]:
-    """Every agent's prox, over the rows of a state.
+    """Proximal step of every agent.
 
     Args:
-        plan: the agents that have constraints; the rows of the others stay at v.
+        plan: the agents that have constraints; the rows of the others are set to v.
         nu: the smoothing.
-        v: (rows, d) the point to stay near.
-        kappa: (rows,) how near.
-        x: (rows, d) where the last step ended.
-        memory: of the last step.
-        offset: added to ln f_i; one number, or one an agent.
-        precision: when to stop.
+        v: (rows, d) centre of the quadratic term.
+        kappa: (rows,) weights κ.
+        x: (rows, d) solution of the last step, where the solver starts.
+        memory: warm start from the last step.
+        offset: () or (N,) added to ln f_i.
+        precision: stopping rule.
 
     Returns:
-        (rows, d) the solution, the memory, and (rows,) the stiffness, NaN for rows that no constraint reads.
+        (rows, d) the solution, the new warm start, and (rows,) the mean diagonal of ∇²f_i, NaN for rows that no constraint reads.
     """
     offset = jnp.broadcast_to(offset, memory.sigma.shape)
 
@@ -76,7 +83,7 @@ def step(
 
     found = []
     for batch in plan.batches:
-        if precision.tolerance is None and len(batch.rows) > 1 and not batch.partial:  # it knows no walls
+        if precision.tolerance is None and len(batch.rows) > 1 and not batch.partial:  # a partial ψ needs a line search
             first = _by_chunk(batch, functools.partial(answers, solve_most))
             found.append(_finish(batch, first, functools.partial(answers, solve)))
         else:
@@ -90,12 +97,12 @@ def step(
 
 
 def _gathered(state: Array, rows: Array) -> Array:
-    """(rows, …) at (n, A) → (n, …, A); 1 where padded."""
+    """(rows, …) indexed by (n, A) → (n, …, A); 1 where padded."""
     return jnp.moveaxis(taken(state, rows, 1.0), 1, -1)
 
 
 class Part(NamedTuple):
-    """Some agents of a batch, (A,), with their rows, (n, A), and constraints."""
+    """One chunk of a batch, or a stack of chunks: agents, (A,), their rows, (n, A), and their constraints."""
 
     agents: Array
     rows: Array
@@ -103,8 +110,8 @@ class Part(NamedTuple):
 
 
 def _by_chunk(batch: Batch, function: Callable[[Batch, Part], tuple[Array, ...]]) -> tuple[Array, ...]:
-    """What a function gives for every chunk, stacked. Of many chunks two are worked on at a time: what does not wait for one another runs
-    on cores of its own."""
+    """Apply a function to every chunk and stack the results. Where there are at least `MANY` chunks, `PAIR` of them are computed in one
+    iteration: their computations are independent, so that they can run on different cores."""
     parts, chunks = Part(batch.agents, batch.rows, batch.kinds), len(batch.rows)
     together = PAIR if chunks >= MANY else 1
 
@@ -123,8 +130,13 @@ def _one(parts: Part, k: int) -> Part:
 
 
 def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[..., tuple[Array, ...]]) -> tuple[Array, ...]:
-    """The answers of those who are not done, gathered into chunks of their own, so that nobody waits for them; `first`: all answers so far,
-    from which they go on, the last of which says who is done."""
+    """Continue the agents that are not done, gathered into new chunks, so that converged agents are not iterated with them.
+
+    Args:
+        batch: the batch.
+        first: results so far: y, stiffness, sigma, sharpness and whether the agent is done, each with a leading axis of chunks.
+        solver: function of the batch, a chunk, a starting point and a mask of agents to skip.
+    """
     chunks, width = batch.agents.shape
     missing = ~first[-1].reshape(-1)
     place = jnp.cumsum(missing.astype(jnp.int32))
@@ -135,14 +147,14 @@ def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[..., tuple[
     def more(at: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         start, (y, stiffness, *numbers) = at
         mine = jax.lax.dynamic_slice(order, (start,), (width,))
-        # the last slice is moved back where it would reach beyond the end
+        # dynamic_slice moves the last slice back so that it ends at the end of `order`; `spare` masks what was done already
         spare = jnp.minimum(start, chunks * width - width) + jnp.arange(width, dtype=jnp.int32) >= total
         chunk, lane = mine // width, mine % width
         part = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[chunk, ..., lane], 0, -1), Part(batch.agents, batch.rows, batch.kinds))
         guess = Guess(jnp.moveaxis(y[chunk, :, lane], 0, -1), numbers[0][chunk, lane], numbers[1][chunk, lane])
         found = solver(batch, part, guess, spare)
         chunk = jnp.where(spare, chunks, chunk)
-        # the agents first, as they are when indexed
+        # indexing with two index arrays puts the agent axis first
         y = y.at[chunk, :, lane].set(jnp.moveaxis(found[0], 1, 0), mode="drop")
         stiffness = stiffness.at[chunk, :, lane].set(jnp.moveaxis(found[1], 1, 0), mode="drop")
         put = [old.at[chunk, lane].set(new, mode="drop") for old, new in zip(numbers, found[2:], strict=True)]
@@ -152,7 +164,7 @@ def _finish(batch: Batch, first: tuple[Array, ...], solver: Callable[..., tuple[
 
 
 def _put_back(where: Array, found: list[Array], others: Array) -> Array:
-    """The answers of all batches, each where it belongs; `others` where there is none."""
+    """Gather the results of all batches in the order of `where`; `others` where there is no result."""
     if not found:
         return others
     flat = jnp.concatenate([each.reshape(-1, *others.shape[1:]) for each in found])

@@ -1,8 +1,8 @@
-"""Agents sorted into batches that are solved together, laid out with the agents last, so that arithmetic runs along them.
+"""Batches of agents that are solved together. The last axis of every array is the agent, so that operations are vectorised over agents.
 
-Agents of the same *pattern* (as many constraints of each family, which read the same of their rows) make one batch: which row a
-constraint reads is then known beforehand, and curvature that does not vary is a constant. Small teams, and agents of rare patterns, are
-padded to a common shape instead, which compiles once.
+Agents with the same *pattern* (the same number of constraints of each family, which read the same of their rows) form one batch. The rows
+that a constraint reads, and a constant curvature, are then static. Small teams, and agents with rare patterns, are padded to a common shape
+instead, which compiles once.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ from consat.problem.family import Family, distinct
 from consat.problem.team import Team
 
 SMALL_TEAM = 2000
-"""Up to so many agents are batched by size and padded, which compiles once; of more, those of the common patterns, which runs faster."""
+"""Largest team whose agents are batched by size and padded, which compiles once. In larger teams common patterns get a batch of their own,
+which runs faster."""
 COMMON = 1 / 8
-"""A pattern that this part of a team has is common."""
+"""Smallest fraction of the agents with constraints that makes a pattern common."""
 SQUARE = 2**15
-"""Numbers in the matrices of a chunk, about: what stays in the cache while it is worked on."""
+"""Approximate number of matrix entries of a chunk, chosen to fit in the cache."""
 WIDEST, NARROWEST = 2048, 64
-"""Agents in a chunk."""
+"""Largest and smallest width of a chunk, in agents."""
 
 MANY, PAIR = 16, 2
-"""Of so many chunks or more there is an even number."""
+"""From `MANY` chunks on, their number is a multiple of `PAIR`, and `PAIR` chunks are computed at a time."""
 
 Matrix = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
 class Form:
-    """What is known beforehand of the constraints of one family in a batch.
+    """Static properties of the constraints of one family in a batch.
 
     Attributes:
-        psi: the function.
-        slots: for each of an agent's constraints which of its rows ψ takes; None where that varies.
-        bend: −∇²ψ, (arity·d)², for weight 1; None where it varies.
-        family: which family of the team it is.
+        psi: the function ψ.
+        slots: (m, arity) which of the agent's rows each constraint reads; None where this differs between agents.
+        bend: (arity·d, arity·d) −∇²ψ for weight 1; None where it varies.
+        family: index of the family in the team.
     """
 
     psi: Callable[..., Any]
@@ -54,14 +55,14 @@ class Form:
 
 
 class Kind(NamedTuple):
-    """The constraints of one family in a batch: m an agent, padded; leading axis the chunks, last axis the agents of a chunk.
+    """The constraints of one family in a batch, m for each agent with padding. The first axis is the chunk, the last the agent in it.
 
     Attributes:
-        slots: (chunks, m, arity, A) which of the agent's rows each constraint reads; None where known beforehand.
-        parameters: (chunks, m, …, A).
+        slots: (chunks, m, arity, A) which of the agent's rows each constraint reads; None where `Form.slots` is set.
+        parameters: name to (chunks, m, …, A).
         weight: (chunks, m, A); None if all are 1.
-        used: (chunks, m, A) false where padded; None if nothing is.
-        members: (chunks, m, A) places in the family; None where parameters stay what they are.
+        used: (chunks, m, A) false where padded; None without padding.
+        members: (chunks, m, A) indices in the family; None where parameters cannot change.
     """
 
     slots: Array | None
@@ -74,14 +75,14 @@ class Kind(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """Agents of like shape.
+    """Agents of similar size.
 
     Attributes:
-        agents: (chunks, A) which; the last is repeated where a chunk is not full.
-        rows: (chunks, n, A) the rows of the state that their constraints read; the padding points past the last row.
-        kinds: their constraints, a family each.
-        forms: what is known of these beforehand.
-        known: whether all of it is.
+        agents: (chunks, A) indices of the agents; the last is repeated where a chunk is not full.
+        rows: (chunks, n, A) rows of the state that their constraints read; padded with the number of rows.
+        kinds: their constraints, one entry per family.
+        forms: static properties of these families.
+        known: whether slots and curvature of all families are static.
         convex: whether every ψ is known to be concave.
         partial: whether some ψ may be −∞ somewhere; see `consat.problem.constraints.domain`.
     """
@@ -98,13 +99,12 @@ class Batch:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Plan:
-    """All batches, and where their answers go: gathered, which is faster than to scatter them.
+    """All batches, and the indices that gather their results (a gather is faster than a scatter).
 
     Attributes:
         batches: the agents that have constraints.
-        row: (rows,) where the answer for each row stands among those of all batches, one after the other; past their end for rows that no
-            constraint reads.
-        agent: (N,) likewise for the agents.
+        row: (rows,) index of each row in the concatenated results of all batches; past their end for rows that no constraint reads.
+        agent: (N,) index of each agent in the concatenated results; past their end for agents without constraints.
         agents: N.
     """
 
@@ -114,7 +114,7 @@ class Plan:
     agents: int = field(metadata={"static": True})
 
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Plan:
-        """The same with other parameters; of each family those that are given, (M_f, …). For a plan made for it."""
+        """Copy with new constraint parameters, for a plan made with ``live``. `values`: for each family those to replace, (M_f, …)."""
 
         def changed(kind: Kind, form: Form) -> Kind:
             own = values[form.family]
@@ -129,8 +129,8 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
 
     Args:
         team: the team.
-        row: gives the row of the copy (holder, position).
-        count: how many rows there are.
+        row: function that returns the rows of the copies (holder, position).
+        count: number of rows.
         convex: whether every ψ is known to be concave.
         live: whether parameters may change; see `Plan.with_parameters`.
     """
@@ -148,7 +148,7 @@ def buckets(team: Team, row: Callable[[np.ndarray, np.ndarray], np.ndarray], cou
     row_start = agent_start = 0
     batches = []
     for one in made:
-        flat = one.rows.ravel()  # chunk by chunk, row by row, agent by agent: the order of answers
+        flat = one.rows.ravel()  # ordered by chunk, row, agent, as the results are
         inside = flat < count
         rows[flat[inside]] = row_start + np.flatnonzero(inside)
         agents[one.agents.ravel()] = agent_start + np.arange(one.agents.size)
@@ -163,9 +163,9 @@ class _Group(NamedTuple):
 
     Attributes:
         agents: (A,).
-        members: for each family (A, m) which of its constraints they have, −1 where padded.
-        positions: (n, A) whose positions these read, −1 where padded.
-        slots: for each family (m, arity, A), or if known beforehand (m, arity).
+        members: for each family (A, m) indices of their constraints, −1 where padded.
+        positions: (n, A) agents whose positions these constraints read, −1 where padded.
+        slots: for each family which of the n rows each constraint reads: (m, arity, A), or (m, arity) if equal for all agents.
     """
 
     agents: np.ndarray
@@ -175,7 +175,7 @@ class _Group(NamedTuple):
 
 
 def _patterns(team: Team, sizes: np.ndarray) -> list[_Group]:
-    """The agents of the common patterns."""
+    """One group for each common pattern. `sizes`: (N, families) number of constraints of each agent."""
     some = np.flatnonzero(sizes.any(axis=1))
     base = np.concatenate([[1], np.cumprod(sizes.max(axis=0).astype(np.int64) + 1)[:-1]])
     code = sizes[some] @ base
@@ -189,7 +189,7 @@ def _patterns(team: Team, sizes: np.ndarray) -> list[_Group]:
 
 
 def _pattern(team: Team, agents: np.ndarray, most: np.ndarray) -> _Group | None:
-    """Agents that have as many constraints of each family; None if these do not read alike."""
+    """Group of agents with the same number of constraints of each family, `most`, (families,); None if their slots differ."""
     members = _members(team, agents, most)
     columns, slots = [agents.astype(np.int32)], []
     for family, mine in zip(team.families, members, strict=True):
@@ -209,7 +209,7 @@ def _pattern(team: Team, agents: np.ndarray, most: np.ndarray) -> _Group | None:
 
 
 def _members(team: Team, agents: np.ndarray, most: np.ndarray) -> list[np.ndarray]:
-    """For each family (A, m) which of its constraints these agents have, −1 where padded."""
+    """For each family (A, m) indices of the constraints of these agents, −1 where padded. `most`: (families,) m."""
     place = np.full(team.count, -1, dtype=np.int32)
     place[agents] = np.arange(len(agents), dtype=np.int32)
     found = []
@@ -229,7 +229,7 @@ def _members(team: Team, agents: np.ndarray, most: np.ndarray) -> list[np.ndarra
 
 
 def _padded(team: Team, sizes: np.ndarray, own: np.ndarray) -> list[_Group]:
-    """These agents by the number of their rows, to the same power of two."""
+    """Groups of the agents `own` by the number of their rows, rounded up to a power of two."""
     if not len(own):
         return []
     n = team.count
@@ -241,7 +241,7 @@ def _padded(team: Team, sizes: np.ndarray, own: np.ndarray) -> list[_Group]:
     first = np.searchsorted(holder, np.arange(n + 1))
     width = np.diff(first)
     power = np.ceil(np.log2(np.maximum(width[own], 4))).astype(int)
-    # the agent's own row comes first: its place does not hang on who the others are
+    # the agent's own row comes first, so that its index does not depend on the other agents
     own_place = np.searchsorted(read, own * (n + 1)) - first[own]
     shifted = np.zeros(n, dtype=np.int64)
     shifted[own] = own_place
@@ -269,7 +269,7 @@ def _own_first(slot: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def _bend(family: Family, dimension: int) -> Matrix | None:
-    """−∇²ψ for weight 1, if it is the same for all members."""
+    """−∇²ψ for weight 1, if it is constant and the same for all members; else None."""
     try:
         constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
     except ValueError:
@@ -281,6 +281,8 @@ def _bend(family: Family, dimension: int) -> Matrix | None:
 
 @dataclass(frozen=True)
 class _Made:
+    """A batch whose agents and rows are still NumPy arrays; see `Batch`."""
+
     agents: np.ndarray
     rows: np.ndarray
     kinds: tuple[Kind, ...]
@@ -317,7 +319,7 @@ def _made(team: Team, group: _Group, bends: Sequence[Matrix | None], row: Callab
         if not members.shape[1]:
             continue
         used = members >= 0
-        index = members if used.all() else np.where(used, members, members[used][0])  # some constraint stands where there is none
+        index = members if used.all() else np.where(used, members, members[used][0])  # padding repeats an existing constraint
         weight = family.weight[index]
         kinds.append(
             Kind(

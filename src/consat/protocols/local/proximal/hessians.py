@@ -1,4 +1,4 @@
-"""∇²L of the agents of a chunk, the lanes, and the linear systems of Newton's method: (diag κ + e^σ ∇²L) y = r."""
+"""∇²L of the agents of a chunk, and the linear systems of Newton's method: (diag κ + e^σ ∇²L) y = r. The last axis is the agent (lane)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from jax import Array
 from consat.numerics import add_up
 
 UNROLLED = 8
-"""Systems of up to so many unknowns are eliminated by a program written out, …"""
+"""Largest number of unknowns for elimination with unrolled pivots."""
 LOOPED = 24
-"""… of up to so many by a loop, and larger ones by LAPACK."""
+"""Largest number of unknowns for elimination by a loop over the pivots; larger systems use LAPACK."""
 
 
 def dot(a: Array, b: Array) -> Array:
-    """(n, A), (n, A) → (A,)."""
+    """Inner product in every lane: (n, A), (n, A) → (A,)."""
     return add_up(a * b)
 
 
 class Dense(NamedTuple):
-    """∇²L as a matrix.
+    """∇²L as a dense matrix.
 
     Attributes:
-        whole: (N, N, A).
-        safe: the same without what is not convex; None where that is not known apart.
-        convex: whether there is nothing that is not.
+        whole: (N, N, A) ∇²L.
+        safe: (N, N, A) a positive semidefinite part of ∇²L; None where it is not available separately.
+        convex: whether ∇²L is known to be positive semidefinite.
     """
 
     whole: Array
@@ -37,20 +37,21 @@ class Dense(NamedTuple):
     convex: bool
 
     def diagonal(self) -> Array:
-        """(N, A)."""
+        """(N, A) diagonal of ∇²L."""
         return jnp.stack([self.whole[i, i] for i in range(len(self.whole))])
 
     def absolute(self, numbers: Array) -> Array:
-        """(N, A) Σ_j |∇²L|_ij r_j."""
+        """(N, A) Σ_j |∇²L|_ij r_j. `numbers`: (N, A) r."""
         return add_up(jnp.abs(jnp.moveaxis(self.whole, 1, 0)) * numbers[:, None])
 
     def solve(self, kappa: Array, multiplier: Array, right: Array) -> Array:
-        """(N, r, A) y; where the matrix is not positive definite, it is made so.
+        """(N, r, A) solutions of (diag κ + e^σ ∇²L) y = r. A matrix that is not positive definite is replaced: with `safe` for ∇²L, or by
+        the absolute values of its eigenvalues.
 
         Args:
-            kappa: (N, A).
+            kappa: (N, A) κ.
             multiplier: (A,) e^σ.
-            right: (N, r, A).
+            right: (N, r, A) right-hand sides.
         """
         diagonal = jnp.eye(len(kappa))[:, :, None] * kappa[None]
         matrix = diagonal + multiplier[None, None] * self.whole
@@ -69,13 +70,13 @@ class Dense(NamedTuple):
 
 
 class Alike(NamedTuple):
-    """∇²L where every ψ is concave and curves alike along all axes, as those of balls and walls do: B ⊗ I + Σ_k w_k a_k a_kᵀ. It is
-    solved by blocks, and direction by direction (Sherman and Morrison), for a fraction of the arithmetic that the matrix takes.
+    """∇²L = B ⊗ I + Σ_k w_k a_k a_kᵀ, for concave ψ with the same curvature along all axes, such as balls and half-spaces. Systems are
+    solved with B, then corrected for one direction after the other (Sherman–Morrison). This takes a fraction of the operations of `Dense`.
 
     Attributes:
         block: (n, n, A) B.
-        directions: (w, a), (A,) and (N, A) each.
-        d: coordinates of a row.
+        directions: pairs (w, a) of shapes (A,) and (N, A).
+        d: number of coordinates of a row.
     """
 
     block: Array
@@ -83,18 +84,18 @@ class Alike(NamedTuple):
     d: int
 
     def diagonal(self) -> Array:
-        """(N, A)."""
+        """(N, A) diagonal of ∇²L."""
         own = jnp.stack([self.block[i // self.d, i // self.d] for i in range(self.d * len(self.block))])
         return add_up([own, *(weight[None] * a**2 for weight, a in self.directions)])
 
     def absolute(self, numbers: Array) -> Array:
-        """(N, A) at least Σ_j |∇²L|_ij r_j."""
+        """(N, A) an upper bound on Σ_j |∇²L|_ij r_j. `numbers`: (N, A) r."""
         rows = numbers.reshape(-1, self.d, numbers.shape[-1])
         own = add_up(jnp.abs(jnp.moveaxis(self.block, 1, 0))[:, :, None] * rows[:, None]).reshape(numbers.shape)
         return add_up([own, *((weight * dot(jnp.abs(a), numbers))[None] * jnp.abs(a) for weight, a in self.directions)])
 
     def solve(self, kappa: Array, multiplier: Array, right: Array) -> Array:
-        """As `Dense.solve`."""
+        """See `Dense.solve`; the matrix is always positive definite."""
         n, wanted = len(self.block), right.shape[1]
         base = jnp.eye(n)[:, :, None] * kappa[:: self.d][None] + multiplier[None, None] * self.block
         sides = jnp.concatenate([right, *(a[:, None] for _, a in self.directions)], axis=1)
@@ -111,14 +112,14 @@ class Alike(NamedTuple):
 
 
 def solve_symmetric(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """Solve a system in every lane.
+    """Solve a symmetric system in every lane.
 
     Args:
         matrix: (N, N, A) symmetric.
         right: (N, r, A).
 
     Returns:
-        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
+        (N, r, A) the solutions, and (A,) whether the matrix is positive definite. For N > 4 · `LOOPED` the latter is not checked and true.
     """
     size = len(matrix)
     if size > LOOPED:
@@ -130,7 +131,7 @@ def solve_symmetric(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
-    """LDLᵀ. Each step goes into the array as it stands, which keeps the compiler from computing earlier steps over and over."""
+    """LDLᵀ elimination with unrolled pivots. Each pivot updates the array, which keeps the compiler from recomputing earlier pivots."""
     put = jax.lax.dynamic_update_slice
     for j in range(size - 1):
         factor = whole[j + 1 :, j] / whole[j, j][None]
@@ -145,7 +146,7 @@ def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
 
 
 def _looped(whole: Array, size: int) -> tuple[Array, Array]:
-    """Gauss and Jordan, without exchanges, which a positive definite matrix does not need."""
+    """Gauss–Jordan elimination without pivoting, which a positive definite matrix does not need."""
 
     def eliminate(j: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
         whole, positive = at

@@ -1,10 +1,12 @@
-"""ln f of the agents of a batch, with its slope and curvature; the agents are the last axis of every array, the lanes.
+"""ln f of the agents of a batch, its gradient and its Hessian. The last axis of every array is the agent (the lane), size A.
 
     L = ν_β/ν_α [ln Σ_k e^{s ν_α v_k}/m]/s + …,    v_k = −ψ_k,    p = softmax(s ν_α v)
     ∇L  = ν_β ḡ,  ḡ = Σ_k p_k ∇v_k
     ∇²L = ν_β (Σ_k p_k ∇²v_k + s ν_α Σ_k p_k (∇v_k − ḡ)(∇v_k − ḡ)ᵀ)
 
-Sums run in a fixed order, and no lane knows how many others there are: what an agent computes is the same alone and among a million.
+Here v_k is the violation of constraint k, s the sharpness of the soft minimum in (0, 1], and m the number of constraints of the agent.
+
+Sums have a fixed order, and no lane depends on the number of lanes: the result of an agent is the same alone and in a large team.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from consat.protocols.local.proximal.hessians import Alike, Dense
 
 
 class Expanded(NamedTuple):
-    """L to second order.
+    """Second-order expansion of L; N = n·d.
 
     Attributes:
         level: (A,) L.
-        slope: (N, A) ∇L, N = n·d.
+        slope: (N, A) ∇L.
         bend: ∇²L.
     """
 
@@ -45,8 +47,8 @@ class Lanes:
     """The objectives of the agents of one chunk.
 
     Attributes:
-        batch: what is known of them; its arrays are not used.
-        kinds: their constraints, without the axis of chunks.
+        batch: static properties of the agents; its arrays are not used.
+        kinds: the constraints, without the axis of chunks.
         nu: the smoothing.
         offset: (A,) added to L.
     """
@@ -57,22 +59,23 @@ class Lanes:
     offset: Array
 
     def violations(self, y: Array) -> Array:
-        """(m, A) −ψ_k at y, (n, d, A); −∞ where padded."""
+        """(m, A) −ψ_k at `y`, (n, d, A); −∞ where padded."""
         return jnp.concatenate([_violations(form, kind, y) for form, kind in zip(self.batch.forms, self.kinds, strict=True)])
 
     def count(self, violations: Array) -> Array:
-        """(A,) how many constraints each agent has."""
+        """(A,) number of constraints of each agent."""
         return add_up((violations > -jnp.inf).astype(violations.dtype))
 
     def level(self, y: Array, sharpness: Array) -> Array:
-        """(A,) L at y, (n, d, A), with a soft minimum of this sharpness in (0, 1], (A,): from the mean (0) to the true one (1)."""
+        """(A,) L at `y`, (n, d, A), with a soft minimum of the given sharpness, (A,): 1 is the soft minimum of the objective, towards 0 it
+        becomes the mean."""
         return self._soft(self.violations(y), sharpness)[0]
 
     def _soft(self, violations: Array, sharpness: Array) -> tuple[Array, Array]:
         """(A,) L and (m, A) the weights p."""
         if self.batch.partial:
             return self._soft_within(violations, sharpness)
-        if len(violations) == 1:  # nothing to be soft about
+        if len(violations) == 1:  # the minimum of one constraint needs no smoothing
             return self.nu.beta * violations[0] + self.offset, jnp.ones_like(violations)
         count = jnp.log(self.count(violations))
         scaled = (sharpness * self.nu.alpha)[None] * violations
@@ -83,8 +86,8 @@ class Lanes:
         return self.nu.beta / self.nu.alpha * (blunt / sharpness + count) + self.offset, powers / total[None]
 
     def _soft_within(self, violations: Array, sharpness: Array) -> tuple[Array, Array]:
-        """The same where some ψ are −∞: L is +∞ there, and its derivatives are those of the other ψ alone. Nothing that is not finite is
-        computed with on the way, so that no derivative is NaN; and ψ may be so steep that the sharpness is next to nothing."""
+        """`_soft` for ψ that may be −∞: L is +∞ there, and its derivatives are those of the other ψ alone. Intermediate values are finite,
+        so that no derivative is NaN. The formula also works for a very small sharpness, which very steep ψ need."""
         inside, number = (violations > -jnp.inf) & (violations <= HUGE), self.count(violations)
         some = jnp.where(inside, violations, 0.0)
         top = jnp.max(jnp.where(inside, violations, -jnp.inf), axis=0)
@@ -97,17 +100,17 @@ class Lanes:
         return jnp.where(self.outside(violations), jnp.inf, level), powers / jnp.where(total > 0.0, total, 1.0)[None]
 
     def outside(self, violations: Array) -> Array:
-        """(A,) whether some ψ is −∞, or as good as that."""
+        """(A,) whether some ψ is below −`HUGE`, which counts as −∞."""
         return jnp.any(violations > HUGE, axis=0)
 
     def bluntest(self, violations: Array) -> Array:
-        """(A,) the sharpness at which a soft minimum sees no kink between the constraints."""
+        """(A,) the sharpness at which the soft minimum is smooth over the spread between the constraints. `violations`: (m, A)."""
         used = violations > -jnp.inf
         spread = jnp.max(violations, axis=0) - add_up(jnp.where(used, violations, 0.0)) / self.count(violations)
         return 1.0 / jnp.maximum(self.nu.alpha * spread, 1.0)
 
     def expand(self, y: Array, sharpness: Array) -> Expanded:
-        """L to second order at y, (n, d, A)."""
+        """Second-order expansion of L at `y`, (n, d, A)."""
         if not self.batch.known:
             return self._expand_any(y, sharpness)
         n, d, _ = y.shape
@@ -125,7 +128,7 @@ class Lanes:
         directions = [(self.nu.beta * self.nu.alpha * sharpness * share, a) for share, a in away]
 
         def constant(whole: Callable[..., np.ndarray]) -> Array:
-            """Σ_k p_k w_k ∇²v_k, of matrices that `whole` gives."""
+            """Σ_k p_k w_k ∇²v_k, with ∇²v_k laid out by `whole`."""
             matrices = [whole(*place, n, d) for place in places]
             terms = [jnp.asarray(m)[:, :, None] * (p[k] * weights[k])[None, None] for k, m in enumerate(matrices) if m.any()]
             return self.nu.beta * add_up(terms) if terms else jnp.zeros((*matrices[0].shape, y.shape[-1]))
@@ -140,7 +143,7 @@ class Lanes:
         return Expanded(level, self.nu.beta * mean, bend)
 
     def _expand_any(self, y: Array, sharpness: Array) -> Expanded:
-        """The same for any ψ and any pattern, by automatic differentiation, an agent at a time."""
+        """`expand` for any ψ and any pattern, by automatic differentiation, vectorised over the agents."""
         n, d, _ = y.shape
 
         def one(flat: Array, kinds: tuple[Kind, ...], offset: Array, sharpness: Array) -> tuple[Array, Array, Array]:
@@ -163,7 +166,7 @@ def _twice(function: Callable[[Array], Array], y: Array) -> tuple[Array, tuple[A
 
 
 def _arguments(form: Form, kind: Kind, y: Array) -> list[Array]:
-    """(m, d, A) the positions that each ψ takes, for each of its arguments."""
+    """For each argument of ψ the positions, (m, d, A), that the constraints read."""
     if form.slots is not None:
         return [jnp.stack([y[slot] for slot in slots]) for slots in zip(*form.slots, strict=True)]
     assert kind.slots is not None
@@ -174,7 +177,7 @@ def _arguments(form: Form, kind: Kind, y: Array) -> list[Array]:
 
 
 def _along(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one constraint of one agent, for all of both."""
+    """Vectorise a function of one constraint of one agent over the constraints (first axis) and the agents (last axis)."""
     return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1))
 
 
@@ -188,7 +191,7 @@ def _violations(form: Form, kind: Kind, y: Array) -> Array:
 
 
 def _slopes(form: Form, kind: Kind, y: Array) -> tuple[Array, Array]:
-    """(m, A) −ψ and (m, arity, d, A) its gradients."""
+    """(m, A) −ψ, −∞ where padded, and (m, arity, d, A) its gradients, 0 where padded."""
     function = jax.value_and_grad(lambda x, p: -form.psi(*x, **p))
     values, found = _along(function)(_arguments(form, kind, y), kind.parameters)
     slopes = jnp.stack(found, axis=1)
@@ -198,13 +201,21 @@ def _slopes(form: Form, kind: Kind, y: Array) -> tuple[Array, Array]:
 
 
 def _placed(slope: Array, slots: tuple[int, ...], n: int) -> Array:
-    """(arity, d, A) → (n·d, A): on the rows that the constraint reads."""
+    """(arity, d, A) → (n·d, A): from the arguments of a constraint to the coordinates of the agent's rows."""
     nothing = jnp.zeros_like(slope[0])
     return jnp.concatenate([slope[slots.index(row)] if row in slots else nothing for row in range(n)])
 
 
 def variance(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-    """The mean ḡ = Σ_k p_k g_k, and Σ_k p_k (g_k − ḡ)(g_k − ḡ)ᵀ as Σ w a aᵀ with one term less (West's recurrence), (w, a) each."""
+    """Weighted mean and covariance of gradients by West's recurrence.
+
+    Args:
+        gradients: m arrays g_k of shape (N, A).
+        p: (m, A) weights.
+
+    Returns:
+        (N, A) the mean ḡ = Σ_k p_k g_k, and m − 1 pairs (w, a) with Σ w a aᵀ = Σ_k p_k (g_k − ḡ)(g_k − ḡ)ᵀ; w: (A,), a: (N, A).
+    """
     mean, total, terms = gradients[0], p[0], []
     for g, share in zip(gradients[1:], p[1:], strict=True):
         away, before, total = g - mean, total, total + share
@@ -216,7 +227,7 @@ def variance(gradients: list[Array], p: Array) -> tuple[Array, list[tuple[Array,
 
 @functools.cache
 def _whole(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
-    """(N, N) ∇²v on all rows."""
+    """(N, N) ∇²v in the coordinates of all n rows."""
     index, whole = (np.array(slots)[:, None] * d + np.arange(d)).ravel(), np.zeros((n * d, n * d))
     whole[np.ix_(index, index)] = bend
     return whole
@@ -224,20 +235,20 @@ def _whole(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
 
 @functools.cache
 def _convex_part(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
-    """(N, N) the same without its negative eigenvalues."""
+    """(N, N) as `_whole`, with negative eigenvalues set to 0."""
     values, vectors = np.linalg.eigh(np.array(bend))
     return _whole(tuple(map(tuple, (vectors * np.maximum(values, 0.0)) @ vectors.T)), slots, n, d)
 
 
 @functools.cache
 def _alike(bend: Matrix, d: int) -> Matrix | None:
-    """C if ∇²v = C ⊗ I, which is to say that it is the same along all d axes."""
+    """C where ∇²v = C ⊗ I, that is, where the curvature is the same along all d axes; else None."""
     block = np.array(bend)[::d, ::d]
     return tuple(map(tuple, block)) if np.array_equal(np.kron(block, np.eye(d)), bend) else None
 
 
 def _block(bend: Matrix, slots: tuple[int, ...], n: int, d: int) -> np.ndarray:
-    """(n, n) C on all rows."""
+    """(n, n) C of `_alike`, laid out on all n rows."""
     block = _alike(bend, d)
     assert block is not None
     return _whole(block, slots, n, 1)

@@ -1,8 +1,8 @@
-"""The saddle point of `consat.protocols.local.proximal`, by Newton's method on both its equations, for the agents of one chunk.
+"""Newton's method for both saddle-point equations of `consat.protocols.local.proximal`, for the agents of one chunk.
 
-For a fixed σ the first equation is the gradient of a strongly convex function of y, and L(y(σ)) − σ falls in σ: Newton on both together,
-with a line search on the first and a bracket on the second, cannot miss. For ψ that are not concave the curvature is made positive where it
-is not, and the bracket still finds a stationary point.
+For a fixed σ the first equation is the gradient of a strongly convex function of y, and L(y(σ)) − σ decreases in σ. So Newton's method on
+both equations, with a line search on the first and a bracket on the second, converges globally. For ψ that are not concave, the Hessian is
+made positive definite where it is not, and the bracket still finds a stationary point.
 """
 
 from __future__ import annotations
@@ -19,21 +19,27 @@ from consat.protocols.local.proximal.lanes import Expanded, Lanes
 
 MOST_ITERATIONS = 200
 SHARPEN = 4.0
-"""Factor by which the soft minimum is sharpened each time its blunter version is solved."""
+"""Factor by which the sharpness is raised each time the problem with the present sharpness is solved."""
 LONGEST_STEP = 3.0
-"""σ rises by at most this much at a time where y answers to it: beyond, the linear model of y says nothing."""
+"""Largest increase of σ in one step where y depends on σ; the linear model of y(σ) is not valid beyond."""
 STRONGEST = 1e12
-"""Where the multiplier outweighs κ by this much, an agent already does all it can for its own constraints, and σ stays."""
+"""Upper bound on the ratio of e^σ ∇²L to κ. Beyond, only the agent's own constraints matter, and σ is not increased any more."""
 UNSEARCHED = 2
-"""Steps of a chunk that go without a line search."""
+"""Largest number of steps without line search in `solve_most`."""
 SCALES = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
-"""Parts of a step that a line search tries."""
+"""Step lengths that the line search tries."""
 SHORT = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
-"""What else it tries where a ψ may end on the way."""
+"""Additional step lengths where the step may leave the domain of a ψ."""
 
 
 class Guess(NamedTuple):
-    """Where solvers stand: (n, d, A) their rows, (A,) ln of the multiplier, and (A,) the sharpness reached."""
+    """Starting point or solution of the solver.
+
+    Attributes:
+        y: (n, d, A) positions.
+        sigma: (A,) σ, logarithm of the multiplier.
+        sharpness: (A,) sharpness of the soft minimum, in (0, 1].
+    """
 
     y: Array
     sigma: Array
@@ -41,18 +47,19 @@ class Guess(NamedTuple):
 
 
 class Precision(NamedTuple):
-    """When to stop.
+    """Stopping rule.
 
     Attributes:
-        tolerance: of both equations: relative to the terms of the first, and on ln f of the second; if None, the first step that begins
-            within reach of the solution is the last, so that whoever begins there takes one.
+        tolerance: of both equations: relative to the terms of the first, absolute on ln f in the second. If None, the solver stops after
+            the first step that starts near the solution (one step for an agent that starts near).
     """
 
     tolerance: float | None
 
 
 class _Search(NamedTuple):
-    """As `Guess`, but (N, A) for y; the bracket of σ, and (n, A) the mean diagonal of ∇²f over the coordinates of each row."""
+    """State of the iteration. As `Guess` with y of shape (N, A); `low` and `high`, (A,), are the bracket of σ; `stiffness`, (n, A), is the
+    mean diagonal of ∇²f over the coordinates of each row."""
 
     y: Array
     sigma: Array
@@ -65,19 +72,36 @@ class _Search(NamedTuple):
 
 
 class _Ahead(NamedTuple):
-    """Newton's step in y: (N, A) for the multiplier as it is, and what it gains for each unit that σ rises."""
+    """Newton step in y.
+
+    Attributes:
+        descend: (N, A) the step for the present multiplier.
+        follow: (N, A) its derivative with respect to σ.
+    """
 
     descend: Array
     follow: Array
 
     def to(self, change: Array) -> Array:
-        """(N, A) the step in y for a change of σ."""
+        """(N, A) the step in y when σ changes by `change`, (A,)."""
         return self.descend + self.follow * jnp.where(change < 0, jnp.exp(change) - 1.0, change)[None]
 
 
 class _Here(NamedTuple):
-    """Where solvers stand: L to second order, its diagonal, what σ cannot exceed, σ and e^σ, the two forces of the first equation,
-    Newton's step and decrement, and whether y is settled for this σ to a fraction of what the second equation lacks."""
+    """Quantities of one iteration.
+
+    Attributes:
+        model: second-order expansion of L.
+        diagonal: (N, A) diagonal of ∇²L.
+        ceiling: (A,) upper bound on σ.
+        sigma: (A,) σ.
+        multiplier: (A,) e^σ.
+        pull: (N, A) κ (y − v), first term of the first equation.
+        push: (N, A) e^σ ∇L, second term of the first equation.
+        ahead: Newton step.
+        decrement: (A,) Newton decrement of the first equation.
+        near: (A,) whether y solves the first equation for this σ, up to a fraction of the residual of the second equation.
+    """
 
     model: Expanded
     diagonal: Array
@@ -91,8 +115,11 @@ class _Here(NamedTuple):
     near: Array
 
     def wanted(self, drop: Array) -> Array:
-        """(A,) the σ that solves both equations to first order; `drop`: what the step in y takes off L. It rises by no more than the linear
-        model is good for."""
+        """(A,) the σ that solves both equations to first order. Its increase is limited to the validity of the linear model.
+
+        Args:
+            drop: (A,) change of L by the step `ahead.descend`, to first order.
+        """
         gap, slope = self.model.level - self.sigma, self.model.slope
         left, reach = gap + drop, jnp.maximum(-dot(slope, self.ahead.follow), 0.0)
         most = jnp.minimum(left, jnp.log(1.0 + jnp.maximum(left, 0.0) / (reach + jnp.finfo(left.dtype).tiny)))
@@ -100,13 +127,13 @@ class _Here(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Answers.
+    """Result of the solver.
 
     Attributes:
-        guess: the solutions, where the next step begins.
-        stiffness: (n, A) the mean diagonal of ∇²f there over the coordinates of each row.
-        iterations: (A,) how many it took.
-        done: (A,) whether these are the answers.
+        guess: the solutions, which are the starting point of the next proximal step.
+        stiffness: (n, A) mean diagonal of ∇²f at the solution, over the coordinates of each row.
+        iterations: (A,) number of iterations.
+        done: (A,) whether the iteration of each agent has ended.
     """
 
     guess: Guess
@@ -118,15 +145,15 @@ class Found(NamedTuple):
 def solve(
     lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision, skip: Array | None = None
 ) -> Found:  # fmt: skip
-    """The prox of the agents of a chunk.
+    """Solve the proximal step of the agents of a chunk.
 
     Args:
         lanes: their objectives.
-        v: (n, d, A) the points to stay near.
-        kappa: (n, A) > 0 how near.
-        guess: where to begin.
-        precision: when to stop.
-        skip: (A,) who needs no answer.
+        v: (n, d, A) centre of the quadratic term.
+        kappa: (n, A) weights κ > 0.
+        guess: starting point.
+        precision: stopping rule.
+        skip: (A,) agents that need no result.
     """
     task = _Task.of(lanes, v, kappa, precision)
     start = task.start(guess)
@@ -136,8 +163,8 @@ def solve(
 
 
 def solve_most(lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Precision) -> Found:
-    """The first steps of `solve`, without its searches and brackets, at a fraction of its cost, until most of the chunk are within reach of
-    the solution, which is all that a `Precision` without tolerance asks of them. The others are not done, but nearer."""
+    """Cheap first steps of `solve`, without line search and bracket, for a `Precision` without tolerance. They end after `UNSEARCHED`
+    steps, or when half of the agents are done; the others are not done, but closer to the solution. Arguments as in `solve`."""
     task = _Task.of(lanes, v, kappa, precision)
 
     def goes_on(at: tuple[Array, _Search]) -> Array:
@@ -149,7 +176,7 @@ def solve_most(lanes: Lanes, v: Array, kappa: Array, guess: Guess, precision: Pr
 
 
 class _Task(NamedTuple):
-    """What a solver has to do; as the arguments of `solve`, but (N, A) for v and κ."""
+    """The arguments of `solve`, with v and κ of shape (N, A). `shape` is (n, d)."""
 
     lanes: Lanes
     v: Array
@@ -166,7 +193,7 @@ class _Task(NamedTuple):
         count = self.v.shape[1]
         infinity = jnp.full(count, jnp.inf, self.v.dtype)
         y = guess.y.reshape(self.v.shape)
-        if self.lanes.batch.partial:  # who is outside begins at v
+        if self.lanes.batch.partial:  # agents outside the domain of a ψ start at v
             y = jnp.where(self.lanes.outside(self.lanes.violations(guess.y))[None], self.v, y)
         nothing = jnp.zeros((self.shape[0], count)), jnp.zeros(count, int), jnp.zeros(count, bool)
         return _Search(y, guess.sigma, guess.sharpness, -infinity, infinity, *nothing)
@@ -178,13 +205,13 @@ class _Task(NamedTuple):
         return self.lanes.level(y.reshape(*self.shape, -1), sharpness)
 
     def step(self, at: _Search) -> _Search:
-        """One step of Newton in every lane that is not done."""
+        """One Newton step in every lane that is not done."""
         here = self.look(at)
         model, ahead, sigma, multiplier, near = here.model, here.ahead, here.sigma, here.multiplier, here.near
         gap, ceiling = model.level - sigma, here.ceiling
 
-        # y alone, for this multiplier, until that much is settled to a fraction of the gap …
-        # … then both at once, σ within a bracket that only certain signs may narrow
+        # while `near` is false, only y moves, for a fixed multiplier; then both move, with σ inside the bracket
+        # the bracket is narrowed only where the sign of the gap is certain
         drop = dot(model.slope, ahead.descend)
         certain = near & (jnp.abs(drop) <= 0.3 * jnp.abs(gap))
         low = jnp.where(certain & (gap > 0), jnp.maximum(at.low, sigma), at.low)
@@ -211,7 +238,7 @@ class _Task(NamedTuple):
         sharpen = near & ((jnp.abs(gap) <= 3.0) | met) & ~sharp
         moves, rises = ~done, near & ~done
         tired = at.iterations + 1 >= MOST_ITERATIONS
-        if self.lanes.batch.partial:  # outside there is nothing to be solved
+        if self.lanes.batch.partial:  # outside the domain there is no solution to find
             tired |= model.level == jnp.inf
         return _Search(
             y=jnp.where(moves[None], to, at.y),
@@ -225,13 +252,13 @@ class _Task(NamedTuple):
         )
 
     def sharper(self, sharpness: Array) -> Array:
-        """(A,) the next sharpness; where some ψ was so steep that it is next to nothing, it rises faster."""
+        """(A,) the next sharpness. For partial ψ it rises faster from very small values, which very steep ψ cause."""
         next_ = SHARPEN * sharpness
         return jnp.minimum(jnp.maximum(next_, jnp.sqrt(sharpness)) if self.lanes.batch.partial else next_, 1.0)
 
     def plain_step(self, at: _Search) -> _Search:
-        """A step of Newton in every lane that is not done, and the last of those that begin it within reach of the solution; y alone moves
-        where they don't."""
+        """One Newton step in every lane that is not done. In lanes that start near the solution it is the last step, and y and σ move. In
+        the others only y moves."""
         here = self.look(at)
 
         def decide() -> tuple[Array, Array, Array]:
@@ -239,7 +266,7 @@ class _Task(NamedTuple):
             last = here.near & (at.sharpness >= 1.0)
             return jnp.where(last, wanted, here.sigma), last, ~at.done & jnp.isfinite(here.decrement)
 
-        # a branch that is always taken, since its results are stored: fused, they would be computed again for every coordinate
+        # always true: `cond` keeps the compiler from fusing `decide` into later code, where it would be recomputed for every coordinate
         sigma, last, moves = jax.lax.cond(jnp.any(~at.done), decide, lambda: (at.sigma, at.done, at.done))
         y = at.y + here.ahead.to(sigma - here.sigma)
         return at._replace(
@@ -250,7 +277,7 @@ class _Task(NamedTuple):
         )
 
     def look(self, at: _Search) -> _Here:
-        """What there is to know where solvers stand."""
+        """Expand L at the present point and compute the Newton step."""
         model = self.lanes.expand(at.y.reshape(*self.shape, -1), at.sharpness)
         diagonal = model.bend.diagonal()
         mean = add_up(jnp.abs(diagonal)) / len(at.y)
@@ -263,18 +290,18 @@ class _Task(NamedTuple):
         gap = model.level - sigma
         decrement = -dot(pull + push, ahead.descend)
         bent = decrement
-        if self.precision.tolerance is None:  # where one step is to be enough, count only how L bends along it: κ is quadratic anyway
+        if self.precision.tolerance is None:  # count only the curvature of L along the step: the κ term is exactly quadratic
             bent = jnp.abs(decrement - dot(self.kappa, ahead.descend**2))
         near = bent <= 0.2 * multiplier * jnp.maximum(1.0, 0.3 * jnp.abs(gap))
         return _Here(model, diagonal, ceiling, sigma, multiplier, pull, push, ahead, decrement, near)
 
     def stiffness(self, here: _Here) -> Array:
-        """(n, A) the mean diagonal of ∇²f over the coordinates of each row."""
+        """(n, A) mean diagonal of ∇²f over the coordinates of each row."""
         bent = jnp.abs(here.diagonal + here.model.slope**2).reshape(*self.shape, -1)
         return here.multiplier[None] * (add_up(jnp.moveaxis(bent, 1, 0)) / self.shape[1])
 
     def search(self, at: _Search, multiplier: Array, descend: Array) -> Array:
-        """Where along a step the function whose gradient the first equation is, is least."""
+        """(N, A) the point y + scale · `descend` with the smallest value of ½ κ ‖y − v‖² + e^σ L(y), over the step lengths `SCALES`."""
 
         def worth(scale: Array) -> Array:
             y = at.y + scale * descend
@@ -286,7 +313,7 @@ class _Task(NamedTuple):
         return at.y + scales[best][None] * descend
 
     def search_within(self, at: _Search, multiplier: Array, step: Array, near: Array) -> Array:
-        """(N, A) as `search`, for ψ that end somewhere, where a step ends; who is near the solution only keeps inside."""
+        """(N, A) as `search`, for ψ with a bounded domain. Lanes near the solution take the longest step that stays inside the domain."""
 
         def level(scale: Array) -> tuple[Array, Array]:
             y = at.y + scale * step
@@ -300,7 +327,7 @@ class _Task(NamedTuple):
         return at.y + scales[best][None] * step
 
     def settled(self, at: _Search, here: _Here) -> tuple[Array, Array]:
-        """(A,) whether the first equation holds, and whether the second does, as far as float64 can tell."""
+        """(A,) whether the first equation holds, and (A,) whether the second holds, within the tolerance and the rounding error."""
         pull, push, slope = here.pull, here.push, here.model.slope
         residual, gap = pull + push, here.model.level - here.sigma
         eps, tolerance = 8 * jnp.finfo(at.y.dtype).eps, self.precision.tolerance or 0.0
@@ -312,13 +339,13 @@ class _Task(NamedTuple):
 
 
 def cold(lanes: Lanes, v: Array, kappa: Array) -> Guess:
-    """Where to begin without a last solution: at v, with the multiplier that one step of Newton would want there, and with a soft minimum
-    so blunt that it sees no kink between the constraints at v.
+    """Starting point without a previous solution: y = v, the multiplier after one Newton step from there, and the sharpness at which the
+    soft minimum is smooth over the spread of the constraints at v.
 
     Args:
         lanes: the objectives.
-        v: (n, d, A).
-        kappa: (n, A).
+        v: (n, d, A) centre of the quadratic term.
+        kappa: (n, A) weights κ.
     """
     tiny = jnp.finfo(v.dtype).tiny
     sharpness = lanes.bluntest(lanes.violations(v))
@@ -326,6 +353,6 @@ def cold(lanes: Lanes, v: Array, kappa: Array) -> Guess:
     reach = add_up(model.slope**2 / jnp.repeat(kappa, v.shape[1], axis=0, total_repeat_length=len(model.slope)))
     height = model.level
     sigma = jnp.minimum(height, jnp.log1p(jnp.maximum(height, 0.0)) - jnp.log(jnp.maximum(reach, tiny)))
-    if lanes.batch.partial:  # outside there is nothing to begin with
+    if lanes.batch.partial:  # outside the domain L is +∞
         sigma, sharpness = jnp.where(jnp.isfinite(sigma), sigma, 0.0), jnp.where(sharpness > 0.0, sharpness, 1.0)
     return Guess(v, sigma, sharpness)
