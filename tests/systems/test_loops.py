@@ -75,3 +75,16 @@ def test_a_team_that_can_be_satisfied_stays_on_its_links() -> None:
     assert summary["satisfied_from"]["round"] <= 8  # measured: 3
     assert "goes over to a spanning tree" in summary["why"]
     assert summary["warnings"] == []
+
+
+def test_long_loops_are_left_to_admm() -> None:
+    count = 100
+    turn = 2 * np.pi * np.arange(count) / count
+    places = count / np.pi * np.column_stack([np.cos(turn), np.sin(turn)])
+    agents = [cs.Agent(f"a{i}", [cs.near(f"a{i - 1}", 3)] if i else []) for i in range(count)]
+    agents[0] = cs.Agent("a0", [cs.near(f"a{count - 1}", 3), cs.within(places[0], 1)])
+    agents[50] = cs.Agent("a50", [cs.near("a49", 3), cs.within(places[50], 1)])
+    summary = cs.run(cs.Team(agents), stop="satisfied").summary
+    assert (summary["protocol"], summary["status"]) == ("admm", "satisfied")
+    assert "loops of 100 agents" in summary["why"]
+    assert summary["satisfied_from"]["round"] <= 60  # 1500 rounds of interior-point did not satisfy two of three rings of 200

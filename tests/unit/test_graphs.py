@@ -174,3 +174,16 @@ def test_full_layout_holds_only_the_own_cluster() -> None:
 def test_unknown_layout_is_refused() -> None:
     with pytest.raises(cs.InvalidSettings, match="must be one of full, local"):
         Estimates.of(example(), "half")  # type: ignore[arg-type]
+
+
+def links_of(graph: nx.Graph) -> np.ndarray:
+    return np.array([sorted(edge) for edge in nx.convert_node_labels_to_integers(graph).edges])
+
+
+def test_length_of_loops() -> None:
+    assert graphs.loop_length(8, links_of(nx.path_graph(8))) == 0.0
+    assert graphs.loop_length(100, links_of(nx.cycle_graph(100))) == 100.0
+    assert graphs.loop_length(400, links_of(nx.grid_2d_graph(20, 20))) == pytest.approx(4.0, abs=0.3)
+    with_tail = nx.disjoint_union(nx.cycle_graph(30), nx.path_graph(50))
+    with_tail.add_edge(0, 30)
+    assert graphs.loop_length(80, links_of(with_tail)) == 30.0

@@ -141,6 +141,30 @@ def hops(count: int, links: np.ndarray) -> int:
     return longest
 
 
+def loop_length(count: int, links: np.ndarray) -> float:
+    """Mean length of the loops that links form, in links; 0 where they form none.
+
+    What hangs on the loops as a tree is left out. The rest has E links, each in two of F = E − N + C + 1 faces, C components: the mean is
+    2E/F (Euler's formula). It is exact for a graph that can be drawn without crossings, such as a ring (N) or a square lattice (about 4).
+
+    Args:
+        count: N, number of agents.
+        links: (L, 2) undirected links, each once.
+    """
+    while len(links):
+        degree = np.bincount(links.ravel(), minlength=count)
+        kept = (degree[links] > 1).all(axis=1)
+        if kept.all():
+            break
+        links = links[kept]
+    if not len(links):
+        return 0.0
+    agents = np.unique(links)
+    parts = connected_components(coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count)), directed=False)[1][agents]
+    faces = len(links) - len(agents) + len(np.unique(parts)) + 1
+    return 2.0 * len(links) / faces
+
+
 def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Breadth-first search from one start per component.
 

@@ -13,6 +13,7 @@ import numpy as np
 from consat.certify.certificate import bounds
 from consat.certify.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings, InvalidTeam, counted
+from consat.problem.graphs import loop_length
 from consat.problem.objective import Schedule
 from consat.problem.team import Team
 from consat.problem.units import Scale, automatic, scale, start_box
@@ -32,6 +33,9 @@ MANY = 5000
 """Number of agents above which admm is the default protocol, because its rounds take less time."""
 FULL = 30
 """Number of agents above which admm is the default protocol in the layout ``full``."""
+LONG = 64
+"""Mean length of loops, in links, above which admm is the default protocol: what an interior-point step tells comes back around the loop
+so late that the steps do not settle."""
 SHARP = 5e-4
 """Gap between the margin and the proven bound at which max-min ends, in the team's unit of ψ."""
 
@@ -80,6 +84,8 @@ def why_admm(team: Team, layout: Layout) -> str | None:
         return f"there are more than {FULL} agents of which everybody holds everything, and messages would be too wide"
     if not shape_of(team).concave.all() and len(team.links) >= team.count:
         return "some constraints are not concave and the links form loops, where admm takes fewer rounds"
+    if (length := loop_length(team.count, team.links)) > LONG:
+        return f"the links form loops of {length:.0f} agents on the average, where admm takes fewer rounds"
     return None
 
 
