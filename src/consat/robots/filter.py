@@ -43,7 +43,7 @@ class Planes(NamedTuple):
     Attributes:
         normals: (N, k, d) unit vectors, towards the robot.
         least: (N, k) smallest allowed n·x, m; `VOID` where there is no plane.
-        slack: (N,) largest distance that a robot may move in a step and the halt after it, m. It protects everything without a plane.
+        slack: (N,) largest distance that a robot may move in a step and the halt after it, m. It keeps robots clear of all without a plane.
     """
 
     normals: Array
@@ -120,7 +120,7 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
             remove in one step. The plane then only keeps the robot from coming nearer.
 
     Returns:
-        one plane for each neighbour. The slack protects the robots beyond `near.beyond`.
+        one plane for each neighbour. The slack keeps robots clear of those beyond `near.beyond`.
     """
     there = near.who < len(place)
     index = jnp.minimum(near.who, len(place) - 1)
@@ -147,7 +147,7 @@ def obstacle_planes(
         stop: as in `neighbour_planes`.
         size: as in `neighbour_planes`.
         obstacles: map of the obstacles.
-        seen: number of parts with a plane. The slack protects the others.
+        seen: number of parts with a plane. The slack keeps robots clear of the others.
         share: fraction of the gap that a robot may use up in a step, in (0, 1].
         explained: as in `neighbour_planes`.
     """
