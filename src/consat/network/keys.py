@@ -1,10 +1,10 @@
-"""A team's own certificate authority, and for each agent a key and a certificate by which the others know it.
+"""Keys and certificates: a certificate authority of the team, and a key and a certificate for each agent.
 
-    DIR/ca.pem, ca-key.pem                          the authority: its key stays where it was made, for who has it can be anybody
-    DIR/<agent>/ca.pem, certificate.pem, key.pem    goes to the agent, and nowhere else
+    DIR/ca.pem, ca-key.pem                          authority; never copy its key: its holder can act as any agent
+    DIR/<agent>/ca.pem, certificate.pem, key.pem    copy this folder to the agent, and to no other machine
 
-The agent's id, as `consat.network.names.spelled` writes it, is the name of its folder and the common name of its certificate. Keys are on
-the curve P-256. What they protect and what they don't: docs/security.md.
+The agent's id, encoded by `consat.network.names.spelled`, is the name of its folder and the common name of its certificate. Keys are on the
+curve P-256. For what the keys protect, and what not, see docs/security.md.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ CA: Final = "ca.pem"
 CA_KEY: Final = "ca-key.pem"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
-"""No folder of an agent can be called like one of these: names as `spelled` have no dot."""
+"""File names. No agent's folder has such a name, because an encoded id has no dot."""
 LOOPBACK: Final = "127.0.0.1"
 DAYS: Final = 365
-"""For which an agent's certificate is valid."""
+"""Validity of an agent's certificate, days."""
 AUTHORITY_DAYS: Final = 3650
 GRACE: Final = datetime.timedelta(days=1)
-"""Certificates are valid from so long ago: a robot's clock may be slow."""
+"""Certificates are valid from this long before their creation, because a robot's clock may be slow."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """What an agent shows to prove who it is, and by what it tells who others are.
+    """Files with which an agent proves its identity and verifies others.
 
     Attributes:
         ca: certificate of the team's authority.
-        certificate: the agent's own, which the authority signed.
-        key: its private key.
+        certificate: certificate of the agent, signed by the authority.
+        key: private key of the agent.
     """
 
     ca: Path
@@ -58,17 +58,17 @@ class Credentials:
 def make(
     ids: Sequence[str], directory: Path, *, addresses: Iterable[str] = (), days: int = DAYS, replace: bool = False
 ) -> None:  # fmt: skip
-    """Make keys and certificates for agents, and the team's authority where the directory has none yet.
+    """Make keys and certificates for agents, and the team's authority if the directory has none yet.
 
     Args:
-        ids: of the agents.
-        directory: see the module.
+        ids: ids of the agents.
+        directory: directory to write to; see the module for its layout.
         addresses: IP addresses and host names, besides 127.0.0.1, at which agents of this team can be reached.
-        days: for which the agents' certificates are valid.
-        replace: renew the keys of agents that have some; the authority always stays.
+        days: validity of the agents' certificates, days.
+        replace: whether to renew the keys of agents that have some. The authority is never renewed.
 
     Raises:
-        NetworkError: an agent has keys already, an address cannot be one, or the authority cannot be used.
+        NetworkError: no id is given, an agent has keys already, `days` or an address is invalid, or the authority cannot be used.
     """
     _require_cryptography()
     if not ids:
@@ -96,14 +96,14 @@ def make(
 
 
 def load(directory: Path, id: str) -> Credentials:  # noqa: A002
-    """The credentials of an agent, which are looked at first: they are its own, belong together, and are valid now.
+    """Find and check the credentials of an agent: id, signature, matching key, validity, and permissions of the key file.
 
     Args:
-        directory: as `make` wrote it, or the agent's own folder.
-        id: of the agent.
+        directory: directory that `make` wrote, or the agent's own folder.
+        id: id of the agent.
 
     Raises:
-        NetworkError: one of these is not so, or others can read the private key.
+        NetworkError: there are no keys, a check fails, or others can read the private key.
     """
     _require_cryptography()
     folder = next((folder for folder in (directory / spelled(id), directory) if (folder / KEY).is_file()), None)
@@ -152,7 +152,7 @@ def _alternatives(addresses: Iterable[str]) -> list[x509.GeneralName]:
 
 
 def _builder(subject: str, issuer: str, key: EllipticCurvePrivateKey, days: float, *, authority: bool) -> x509.CertificateBuilder:
-    """What certificates of agents and of the authority have in common."""
+    """The fields that certificates of agents and of the authority have in common."""
     from cryptography import x509
 
     now = datetime.datetime.now(datetime.UTC)
@@ -281,7 +281,10 @@ def _private_pem(key: EllipticCurvePrivateKey) -> bytes:
 
 
 def _write_all(folder: Path, files: dict[str, bytes], *, replace: bool = False) -> None:
-    """Files that only their owner can read, from their first byte on; certificates may be read by all."""
+    """Write files. Private keys are created with owner-only permissions, before the first byte is written.
+
+    With `replace`, each file is written under another name and then renamed, so that no reader finds a part of it.
+    """
     for name, content in files.items():
         path = folder / name
         fresh = path.with_suffix(".new") if replace else path

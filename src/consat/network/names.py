@@ -1,4 +1,4 @@
-"""Agents' ids may be any text; key expressions, certificates and file names may not."""
+"""Encoding of agents' ids, which may be any text, for key expressions, certificates and file names, which may not."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from urllib.parse import quote
 from consat.errors import NetworkError, shown
 
 LONGEST: Final = 64
-"""Characters of a certificate's common name (RFC 5280, ub-common-name)."""
+"""Most characters of a certificate's common name (RFC 5280, ub-common-name)."""
 
 
 def spelled(text: str) -> str:
-    """The text in letters, digits and ``_-~%``, at most `LONGEST` of them; different texts differ.
+    """Encode a text in at most `LONGEST` letters, digits and ``_-~%``. Different texts have different encodings.
 
-    Everything else is percent-encoded, the dot too: `..` is a directory. What is longer is told by its hash, in the form ``%%…`` that no
-    encoding has.
+    All other characters are percent-encoded. The dot is encoded, too, because ``..`` is a directory. If the encoding is too long, it is
+    ``%%`` and a part of the text's SHA-256 hash; no percent-encoding begins with ``%%``.
+
+    Raises:
+        NetworkError: the text is empty, or UTF-8 cannot encode it.
     """
     try:
         name = quote(text, safe="").replace(".", "%2E")

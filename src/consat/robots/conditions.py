@@ -1,4 +1,4 @@
-"""What must hold for the theorem of docs/robots.md, and which of it does not."""
+"""Check of the conditions of the theorem in docs/robots.md."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from consat.robots.drive import Drive, Report, longest_halt
 def conditions(
     drive: Drive, state: Any = None, *, noise: float = 0.0, wind: float = 0.0, paused: float = 0.0, report: Report | None = None
 ) -> tuple[str, ...]:
-    """The conditions of the theorem that do not hold, one sentence each; empty where nothing can touch.
+    """The conditions of the theorem that do not hold, one sentence each. If the tuple is empty, no bodies can touch.
 
     Args:
         drive: the robot layer.
-        state: of the robots at the start; None of those that began at rest, and of which the report tells how near they were.
-        noise: the most that a measured position is wrong by, m.
+        state: state of the robots at the start. None skips these checks, for robots that began at rest: the report has their overlaps.
+        noise: largest error of a measured position, m.
         wind: speed of the air, m/s.
-        paused: the longest that a command was held beyond `drive.dt`, s.
-        report: of a run; None before it.
+        paused: longest time that a command was held beyond `drive.dt`, s.
+        report: report of a run; None before a run.
     """
     model, count, dt = drive.model, drive.count, drive.dt
     broken = []
@@ -52,7 +52,7 @@ def conditions(
 
 
 def _told(report: Report) -> Iterator[str]:
-    """What a run's report says of conditions that did not hold."""
+    """Sentences for the conditions that did not hold, by the report of a run."""
     if float(report.overlap) > 0.0:
         yield (
             f"distance: robots, or one and an obstacle, were {float(report.overlap):.3g} m nearer to each other than the filter keeps, "
@@ -63,7 +63,7 @@ def _told(report: Report) -> Iterator[str]:
 
 
 def _drifts(drive: Drive, wind: float) -> bool:
-    """Whether the air moves what the filter keeps apart, after one step at rest."""
+    """Whether wind moves the places that the filter keeps apart, in one step of robots at rest."""
     state = drive.model.start(jnp.zeros((drive.count, drive.dimension)))
     still = drive.model.halt(state, drive.dt)
     air = jnp.full((drive.count, drive.dimension), wind)
@@ -72,7 +72,7 @@ def _drifts(drive: Drive, wind: float) -> bool:
 
 
 def _overlaps(drive: Drive, place: np.ndarray) -> str | None:
-    """Who starts nearer to another, or to an obstacle, than the filter keeps."""
+    """Text about the first robot that is nearer to another, or to an obstacle, than the filter keeps; None if there is none."""
     from scipy.spatial import cKDTree
 
     size = np.asarray(drive.model.size(drive.count, drive.dt))

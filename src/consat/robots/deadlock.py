@@ -1,9 +1,9 @@
-"""Ways out of deadlock: four rules by which each robot bends its wish before the safety filter, from what it sees.
+"""Deadlock resolution: four rules that change a robot's wished velocity before the safety filter.
 
-* Circulation: the wish bends round whoever is ahead and closing in, always to the same side.
-* While the filter refuses the straight way the wish turns away, up to a right angle; a blocked ring becomes a roundabout.
-* While it doesn't, the wish turns back.
-* Who has arrived steps aside for who hasn't.
+1. The wish bends around a neighbour that is ahead and coming closer, always to the same side (to the right in the plane).
+2. While the filter refuses the straight way, the wish turns to that side, up to a right angle. A blocked ring becomes a roundabout.
+3. While the filter allows the straight way, the wish turns back.
+4. A robot that has arrived moves aside for a robot that has not.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from consat.robots.neighbours import Near
 
 @dataclass(frozen=True)
 class Rules:
-    """How strong each rule is. The values were tuned on circles and on random crowds (docs/benchmarks/robots.md).
+    """Parameters of the rules. The values were tuned on circles and on random crowds (docs/benchmarks/robots.md).
 
     Attributes:
-        bend: sideways part of the wish before somebody in the way, at touch.
-        reach: how far off others count, as the way at top speed in so many seconds.
-        closing: the part of a neighbour's weight that depends on how fast it comes closer.
-        refused: the straight way is refused when this part of the speed, or less, is left of it.
-        up: right angles that a refused wish turns by, 1/s.
-        down: right angles that it turns back by, 1/s.
-        aside: speed of an arrived robot away from one that touches it, of its top speed.
+        bend: sideways part of the direction, relative to the part ahead, for a neighbour straight ahead at contact.
+        reach: neighbours count up to the distance that a robot travels at top speed in this time, s.
+        closing: fraction of a neighbour's weight that is proportional to the speed at which it comes closer, 0 to 1.
+        refused: the straight way counts as refused if the filter leaves at most this fraction of the wished speed along it.
+        up: rate at which a refused wish turns away, right angles per s.
+        down: rate at which it turns back, right angles per s.
+        aside: speed of an arrived robot away from a neighbour at contact, relative to its top speed.
     """
 
     bend: float = 1.5
@@ -43,13 +43,13 @@ class Rules:
 
 @dataclass(frozen=True)
 class Sight:
-    """What N robots see of k neighbours each.
+    """What N robots know of k neighbours each.
 
     Attributes:
-        away: (N, k, d) unit vectors from the neighbours.
-        gap: (N, k) between surfaces, m; infinite where there is no neighbour.
-        velocity: (N, k, d) of the neighbours, m/s.
-        underway: (N, k) which of them have not arrived.
+        away: (N, k, d) unit vectors from the neighbours to the robot.
+        gap: (N, k) distance between the kept discs along `away`, m; infinite where there is no neighbour.
+        velocity: (N, k, d) velocities of the neighbours, m/s.
+        underway: (N, k) whether the neighbour has not arrived yet.
     """
 
     away: Array
@@ -59,7 +59,16 @@ class Sight:
 
 
 def sight(planes: Planes, place: Array, size: Array, velocity: Array, underway: Array, near: Near) -> Sight:
-    """What is seen of neighbours: their planes' normals, and positions (N, d), sizes (N,), velocities (N, d) and who is underway, (N,)."""
+    """Collect what robots know of their neighbours.
+
+    Args:
+        planes: planes whose first columns are those of the neighbours, from `neighbour_planes`.
+        place: (N, d) positions, m.
+        size: (N,) radius that each robot keeps free, m.
+        velocity: (N, d) velocities, m/s.
+        underway: (N,) whether a robot has not arrived yet.
+        near: neighbours of each robot.
+    """
     there = near.who < len(place)
     index = jnp.minimum(near.who, len(place) - 1)
     normals = planes.normals[:, : near.who.shape[1]]
@@ -68,16 +77,16 @@ def sight(planes: Planes, place: Array, size: Array, velocity: Array, underway: 
 
 
 def bent(rules: Rules, ahead: Array, pace: Array, top: Array, *, underway: Array, blocked: Array, seen: Sight) -> Array:
-    """The wish by all rules, (N, d), m/s.
+    """(N, d) wished velocity after all rules, m/s.
 
     Args:
-        rules: see there.
-        ahead: (N, d) unit vector along the way.
+        rules: parameters of the rules.
+        ahead: (N, d) unit vectors along the straight way.
         pace: (N,) wished speed, m/s.
-        top: (N,) largest speed, m/s.
-        underway: (N,) who has not arrived.
-        blocked: (N,) right angles to turn by, from `refused`.
-        seen: neighbours.
+        top: (N,) speed limit, m/s.
+        underway: (N,) whether a robot has not arrived yet.
+        blocked: (N,) angle to turn by, in right angles, 0 to 1, from `refused`.
+        seen: the neighbours, from `sight`.
     """
     closeness = jnp.clip(1.0 - seen.gap / (rules.reach * top[:, None]), 0.0, 1.0)
     closing = jnp.clip(-dot((ahead * top[:, None])[:, None] - seen.velocity, seen.away) / top[:, None], 0.0, 1.0)
@@ -94,14 +103,26 @@ def bent(rules: Rules, ahead: Array, pace: Array, top: Array, *, underway: Array
 
 
 def refused(rules: Rules, blocked: Array, ahead: Array, pace: Array, straight: Array, *, underway: Array, dt: float | Array) -> Array:
-    """`blocked` after `dt`, given what velocity, (N, d), the filter leaves of the straight way."""
+    """(N,) the angle `blocked` of rules 2 and 3 after `dt`, in right angles, 0 to 1.
+
+    Args:
+        rules: parameters of the rules.
+        blocked: (N,) angle before.
+        ahead: (N, d) unit vectors along the straight way.
+        pace: (N,) wished speed, m/s.
+        straight: (N, d) velocity nearest to the straight way that the filter allows, m/s.
+        underway: (N,) whether a robot has not arrived yet.
+        dt: time step, s.
+    """
     stuck = underway & (jnp.sum(straight * ahead, axis=1) <= rules.refused * pace)
     return jnp.clip(blocked + dt * jnp.where(stuck, rules.up, -rules.down), 0.0, 1.0)
 
 
 def _quarter(vectors: Array, ahead: Array) -> Array:
-    """`vectors`, (…, d), turned by a right angle: counter-clockwise; in space about the vertical, or, for who goes up or down, about the
-    first axis; on a line not at all."""
+    """`vectors`, (…, d), turned by a right angle: counter-clockwise in the plane; zero on a line.
+
+    In space they turn about the vertical axis, or about the first axis for robots that move steeply (`ahead`, (…, d)).
+    """
     dimension = vectors.shape[-1]
     if dimension == 1:
         return jnp.zeros_like(vectors)

@@ -1,12 +1,13 @@
-"""The distributed safety filter: each robot keeps to its side of a plane between itself and everything that is near.
+"""Distributed safety filter: each robot stays on its side of a plane between itself and each nearby robot or obstacle.
 
-Each robot i, by itself, from what it measures: for each neighbour j the closest points of the two segments [place, stop], s_i and s_j, with
-n = (s_i − s_j)/‖s_i − s_j‖ and the gap g = ‖s_i − s_j‖ − (size_i + size_j); for each obstacle the closest point of its own segment and of
-the obstacle. The next velocity is the one nearest to the wish for which the next segment [place, stop] stays in
+Each robot i computes its filter alone, from its measurements. `place` is its position; `stop` is where it comes to rest if it halts now.
+For each neighbour j, s_i and s_j are the closest points of the two segments [place, stop], n = (s_i − s_j)/‖s_i − s_j‖, and the gap is
+g = ‖s_i − s_j‖ − (size_i + size_j). For each obstacle, s_j is the point of the obstacle that is closest to the robot's segment. The filter
+chooses the reachable velocity nearest to the wished one for which the next segment [place, stop] stays in
 
-    n·x ≥ n·s_i − share·g/2   (neighbours; each gives half)        n·x ≥ n·s_i − share·g   (obstacles)
+    n·x ≥ n·s_i − share·g/2   (neighbours: each robot uses half)    n·x ≥ n·s_i − share·g   (obstacles)
 
-and which can be reached. What was found is checked against the model's own step; a robot for which it fails halts. The theorem, its
+The command is then checked with the model's own step. If there is no such velocity, or the check fails, the robot halts. The theorem, its
 conditions and its proof are in docs/robots.md.
 """
 
@@ -25,24 +26,24 @@ from consat.robots.neighbours import Near
 from consat.robots.obstacles import Map
 
 ROUNDING = 1e-9
-"""Of a row, m/s, and of a checked step, m. `HAIR` keeps it from adding up."""
+"""Tolerance of a row, m/s, and of the check of a step, m. The addition `HAIR` to the radius covers it."""
 HAIR = 1e-6
-"""Added to each body's radius, m."""
+"""Addition to each body's radius against rounding, m."""
 FLAT = 1e-12
-"""What a row is, per m/s, that no velocity within reach can change."""
+"""Length of a projected normal below which a row counts as constant: no reachable velocity changes its value."""
 VOID = -1e9
-"""The right side of a row that never binds, m/s, and of a plane, m."""
+"""Right-hand side of an unused row, m/s, or of an unused plane, m: it never binds."""
 TINY = 1e-18
-"""Squared lengths, m², below which a segment is a point."""
+"""Squared length below which a segment counts as a point, m²."""
 
 
 class Planes(NamedTuple):
     """Half-spaces n·x ≥ least in which the next segment [place, stop] of each robot must lie.
 
     Attributes:
-        normals: (N, k, d) unit vectors.
-        least: (N, k), m; `VOID` where there is no plane.
-        slack: (N,) how far from where it is a robot may come in a step and the halt after it, m, for the sake of all without a plane.
+        normals: (N, k, d) unit vectors, towards the robot.
+        least: (N, k) smallest allowed n·x, m; `VOID` where there is no plane.
+        slack: (N,) largest distance that a robot may move in a step and the halt after it, m. It keeps robots clear of all without a plane.
     """
 
     normals: Array
@@ -54,14 +55,14 @@ def filtered(model: Model[Any], state: Any, wish: Array, planes: Planes, dt: flo
     """The command nearest to a wished velocity that keeps every robot on its side of its planes.
 
     Args:
-        model: of the robots.
-        state: of N robots.
-        wish: (N, d), m/s.
-        planes: from `neighbour_planes` and `obstacle_planes`, `joined`.
-        dt: how long the command is held, s.
+        model: model of the robots.
+        state: state of the N robots.
+        wish: (N, d) wished velocity, m/s.
+        planes: planes from `neighbour_planes` and `obstacle_planes`, combined by `joined`.
+        dt: duration of the command, s.
 
     Returns:
-        (N, m) the command, and (N,) whether it moves on; where not, it halts.
+        (N, m) commands, and (N,) whether the robot moves on; where False, the command is a halt.
     """
     center, radius = model.reach(state, dt)
     rows = model.rows(state, planes.normals, planes.least, dt) - along(planes.normals, center)
@@ -70,8 +71,21 @@ def filtered(model: Model[Any], state: Any, wish: Array, planes: Planes, dt: flo
 
 
 def steered(model: Model[Any], state: Any, wish: Array, straight: Array, planes: Planes, dt: float) -> tuple[Array, Array, Array]:
-    """As `filtered`, and beside it, (N, d), the velocity nearest to another one, `straight`, (N, d), that the planes leave to a robot which
-    could take up any speed at once. Both problems are solved as one, of 2 N robots: that halves what is compiled."""
+    """As `filtered`, and also the velocity nearest to `straight` within the planes, without limits of acceleration.
+
+    Both problems are solved as one problem of 2 N robots, which halves the size of the compiled program.
+
+    Args:
+        model: as in `filtered`.
+        state: as in `filtered`.
+        wish: as in `filtered`.
+        straight: (N, d) second wished velocity, m/s; its speed is the limit of the second problem.
+        planes: as in `filtered`.
+        dt: as in `filtered`.
+
+    Returns:
+        (N, m) commands, (N,) whether the robot moves on, and (N, d) the velocity nearest to `straight`, m/s; 0 if there is none.
+    """
     center, radius = model.reach(state, dt)
     limits = model.rows(state, planes.normals, planes.least, dt)
     wishes = jnp.concatenate([shortened(wish, model.bounded(planes.slack, dt)) - center, straight])
@@ -83,7 +97,10 @@ def steered(model: Model[Any], state: Any, wish: Array, straight: Array, planes:
 
 
 def _checked(model: Model[Any], state: Any, velocity: Array, there: Array, planes: Planes, dt: float) -> tuple[Array, Array]:
-    """The command for a velocity (N, d) if there is one, (N,), and if the model's own step keeps the planes; else a halt."""
+    """The command for a velocity (N, d), and whether the robot moves on, (N,).
+
+    The command is a halt where the problem has no solution (`there` is False) or the model's own step leaves the planes.
+    """
     command = model.command(state, velocity, dt)
     kept = jnp.all(model.lowest(state, command, planes.normals, dt) >= planes.least - ROUNDING, axis=1)
     moves = there & kept & (model.farthest(state, command, dt) <= planes.slack + ROUNDING)
@@ -91,16 +108,19 @@ def _checked(model: Model[Any], state: Any, velocity: Array, there: Array, plane
 
 
 def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, share: float = 1.0, *, explained: float = np.inf) -> Planes:
-    """The planes between robots, from positions that were measured.
+    """The planes between robots, from measured positions.
 
     Args:
-        place: (N, d).
-        stop: (N, d) where each comes to rest if it halts now; None where all halt at once.
-        size: (N,) the radius that each keeps.
-        near: neighbours, in `place`.
-        share: of the gap that two robots may use up together in a step.
-        explained: how deep an overlap may seem by noise alone, m. Who overlaps by more, which the theorem excludes, need not make up for it
-            at once, which may be out of reach, but comes no nearer.
+        place: (N, d) measured positions, m.
+        stop: (N, d) where each robot comes to rest if it halts now, m; None if all robots halt at once.
+        size: (N,) radius that each robot keeps free, m.
+        near: neighbours of each robot, as indices into `place`.
+        share: fraction of the gap that two robots together may use up in a step, in (0, 1].
+        explained: largest overlap that noise alone can explain, m. A larger overlap, which the theorem excludes, may be impossible to
+            remove in one step. The plane then only keeps the robot from coming nearer.
+
+    Returns:
+        one plane for each neighbour. The slack keeps robots clear of those beyond `near.beyond`.
     """
     there = near.who < len(place)
     index = jnp.minimum(near.who, len(place) - 1)
@@ -120,7 +140,17 @@ def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, 
 def obstacle_planes(
     place: Array, stop: Array | None, size: Array, obstacles: Map, seen: int, *, share: float = 1.0, explained: float = np.inf
 ) -> Planes:
-    """The planes between robots and the `seen` convex parts of obstacles that are nearest; arguments as for `neighbour_planes`."""
+    """The planes between each robot and the nearest convex parts of obstacles.
+
+    Args:
+        place: as in `neighbour_planes`.
+        stop: as in `neighbour_planes`.
+        size: as in `neighbour_planes`.
+        obstacles: map of the obstacles.
+        seen: number of parts with a plane. The slack keeps robots clear of the others.
+        share: fraction of the gap that a robot may use up in a step, in (0, 1].
+        explained: as in `neighbour_planes`.
+    """
     distance = obstacles.distances(place) - size[:, None]
     length = jnp.zeros_like(size) if stop is None else jnp.sqrt(squared(stop - place))
     count = distance.shape[1]
@@ -136,7 +166,7 @@ def obstacle_planes(
 
 
 def joined(first: Planes, second: Planes) -> Planes:
-    """Both sets of planes."""
+    """The planes of both sets, with the smaller slack."""
     return Planes(
         jnp.concatenate([first.normals, second.normals], axis=1),
         jnp.concatenate([first.least, second.least], axis=1),
@@ -145,7 +175,15 @@ def joined(first: Planes, second: Planes) -> Planes:
 
 
 def margin(model: Model[Any], count: int, dt: float, noise: float, share: float = 1.0) -> float:
-    """What is added to every body's radius so that positions may be wrong by up to `noise`, m; see docs/robots.md."""
+    """Addition to every body's radius, m, for position errors up to `noise`, m. It is `HAIR` + μ, derived in docs/robots.md.
+
+    Args:
+        model: model of the robots.
+        count: number of robots, N.
+        dt: duration of a command, s.
+        noise: largest error of a measured position, m.
+        share: as in `neighbour_planes`.
+    """
     size, pace = np.asarray(model.size(count, dt)), np.asarray(model.pace(count))
     return HAIR + noise * (1.0 + np.sqrt(2.0) * pace.max() * dt / (share * size.min()))
 
@@ -173,27 +211,27 @@ def _closest(own: Array, along_own: Array, other: Array, along_other: Array) -> 
 
 
 def nearest(wish: Array, normals: Array, least: Array, radius: Array) -> tuple[Array, Array]:
-    """The velocity nearest to `wish` with normals·u ≥ least and ‖u‖ ≤ radius, of each of N robots; exact, in 1, 2 and 3 dimensions.
+    """For each of N robots, the velocity u nearest to `wish` with normals·u ≥ least and ‖u‖ ≤ radius. Exact, for d = 1, 2, 3.
 
-    One row after the other: as long as the best velocity for the rows so far fulfils the next row it stays, else the new best lies on that
-    row's plane, where the same problem has one dimension less (Seidel's algorithm; ORCA solves its linear programs so).
+    The rows are added one by one. If the best velocity so far satisfies the next row, it stays. Else the new best lies on the plane of that
+    row, where the problem has one dimension less (Seidel's algorithm, which ORCA uses for its linear programs).
 
     Args:
-        wish: (N, d).
+        wish: (N, d) wished velocity, m/s.
         normals: (N, k, d) unit vectors.
-        least: (N, k); `VOID`, or less, for a row that does not count.
-        radius: (N,).
+        least: (N, k) right-hand sides, m/s; `VOID` or less for an unused row.
+        radius: (N,) largest speed, m/s.
 
     Returns:
-        (N, d) the velocity, and (N,) whether there is one; 0 where there is none.
+        (N, d) velocities, and (N,) whether there is a solution; the velocity is 0 where there is none.
     """
-    rows = jnp.moveaxis(normals, (0, 1, 2), (2, 1, 0))  # the robots last: what is computed of all at once lies side by side in memory
+    rows = jnp.moveaxis(normals, (0, 1, 2), (2, 1, 0))  # robots on the last axis: vectorised operations read contiguous memory
     point, there = _nearest(wish.T, rows, jnp.maximum(least, VOID).T, radius)
     return jnp.where(there[None], point, 0.0).T, there
 
 
 def _nearest(wish: Array, normals: Array, least: Array, radius: Array) -> tuple[Array, Array]:
-    """As `nearest`, for wish (d, …), normals (d, k, …) of any length, least (k, …), radius (…)."""
+    """As `nearest`, with robots on the last axes: wish (d, …), normals (d, k, …) of any length, least (k, …), radius (…)."""
     if len(wish) == 1:
         return _on_a_line(wish[0], normals[0], least, radius)
     length = jnp.sqrt(add_up(normals**2))
@@ -205,7 +243,9 @@ def _nearest(wish: Array, normals: Array, least: Array, radius: Array) -> tuple[
     count = len(least)
     foot, axes = normals * least[None], _axes(normals)  # the plane of each row: its point nearest to 0, and vectors that span it
     order = jnp.arange(count)
-    before = (order[:, None] < order[None]).reshape(count, count, *(1,) * radius.ndim)  # on its plane, a row minds those before it
+    before = (order[:, None] < order[None]).reshape(
+        count, count, *(1,) * radius.ndim
+    )  # on the plane of a row, only the rows before it count
     left = radius[None] ** 2 - least**2
     inner, fits = _nearest(
         jnp.stack([add_up(axis * wish[:, None]) for axis in axes]),
@@ -225,7 +265,7 @@ def _nearest(wish: Array, normals: Array, least: Array, radius: Array) -> tuple[
 
 
 def _on_a_line(wish: Array, slopes: Array, least: Array, radius: Array) -> tuple[Array, Array]:
-    """One dimension: slopes (k, …) times u ≥ least is an interval."""
+    """The problem in one dimension: slopes (k, …)·u ≥ least is an interval of u."""
     flat = jnp.abs(slopes) < FLAT
     ends = least / jnp.where(flat, 1.0, slopes)
     low = jnp.max(jnp.where(flat | (slopes < 0.0), -jnp.inf, ends), axis=0, initial=-jnp.inf)
@@ -236,7 +276,7 @@ def _on_a_line(wish: Array, slopes: Array, least: Array, radius: Array) -> tuple
 
 
 def _axes(normal: Array) -> list[Array]:
-    """Unit vectors (d, …) that span the plane across `normal`, (d, …)."""
+    """d − 1 unit vectors (d, …) that span the plane perpendicular to `normal`, (d, …)."""
     if len(normal) == 2:
         return [jnp.stack([-normal[1], normal[0]])]
     x, y, z = normal

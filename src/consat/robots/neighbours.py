@@ -1,7 +1,7 @@
-"""Who is near: the nearest few of each robot, from candidates that are looked for anew only when somebody has moved far enough.
+"""Nearest neighbours of each robot, from a list of candidates that is rebuilt only when robots have moved far enough.
 
-All distances between a thousand robots, and the least forty of each, take as long as the rest of a step ten times. The list stays right
-as long as the nearest that is not on it can't have come closer than the nearest that a robot needs.
+For a thousand robots, a rebuild (all distances, and the forty smallest for each robot) takes ten times as long as the rest of a step. The
+list remains valid while no unlisted robot can be closer than the neighbours that are needed.
 """
 
 from __future__ import annotations
@@ -15,13 +15,19 @@ from jax import Array
 from consat.numerics import add_up
 
 LISTED = 40
-"""Candidates of each robot. In a packed crowd three shells around it have 36."""
+"""Number of candidates of each robot. In a dense packing, the three shells around a robot have 36 robots."""
 ROUNDED = 1.0 - 1e-6
-"""Distances are compared in float32, where JAX sorts ten times as fast; what is beyond is put that much nearer."""
+"""Distances are compared in float32, where JAX sorts ten times as fast. Lower bounds are reduced by this factor against rounding."""
 
 
 class Candidates(NamedTuple):
-    """who: (N, K) others; found: (N, d) where all were then; beyond: (N,) the distance, then, to the nearest that is not listed."""
+    """Candidates at the time of the last rebuild.
+
+    Attributes:
+        who: (N, K) indices of the listed robots.
+        found: (N, d) positions of all robots at that time.
+        beyond: (N,) lower bound on the distance to the nearest unlisted robot at that time.
+    """
 
     who: Array
     found: Array
@@ -29,14 +35,19 @@ class Candidates(NamedTuple):
 
 
 class Near(NamedTuple):
-    """who: (N, k) the nearest others, N where there is none; beyond: (N,) no other robot is nearer than this."""
+    """Neighbours of each robot.
+
+    Attributes:
+        who: (N, k) indices of the nearest robots; N where there is none.
+        beyond: (N,) lower bound on the distance to every robot that is not in `who`.
+    """
 
     who: Array
     beyond: Array
 
 
 def candidates(place: Array) -> Candidates:
-    """Candidates for N robots at `place`, (N, d)."""
+    """Build the lists of candidates for N robots at `place`, (N, d)."""
     count = len(place)
     squared = add_up([(place[:, axis][:, None] - place[:, axis][None]).astype(jnp.float32) ** 2 for axis in range(place.shape[1])])
     rows = jnp.arange(count, dtype=jnp.int32)
@@ -48,13 +59,13 @@ def candidates(place: Array) -> Candidates:
 
 
 def near(known: Candidates, place: Array, seen: int, reach: float) -> tuple[Candidates, Near]:
-    """The `seen` nearest within `reach` of each robot, and the candidates for the next time.
+    """The nearest robots of each robot within a range, and the candidates for the next call.
 
     Args:
-        known: from the last time.
-        place: (N, d) where all are now.
-        seen: k.
-        reach: of the sensors, m; who is farther is not looked at.
+        known: candidates from the last call.
+        place: (N, d) present positions.
+        seen: largest number of neighbours, k.
+        reach: range of the sensors, m. Robots farther away are ignored.
     """
     least, index, beyond, enough = _near(known, place, seen)
     complete = known.who.shape[1] == len(place) - 1
@@ -65,7 +76,12 @@ def near(known: Candidates, place: Array, seen: int, reach: float) -> tuple[Cand
 
 
 def _near(known: Candidates, place: Array, seen: int) -> tuple[Array, Array, Array, Array]:
-    """(N, k) distances and indices of the nearest, (N,) what nobody else is nearer than, (N,) whether the list was long enough for that."""
+    """Nearest robots among the candidates.
+
+    Returns:
+        (N, k) distances, (N, k) indices, (N,) lower bound on the distance to all other robots, and (N,) whether the list is still valid:
+        the nearest robots are surely among the candidates.
+    """
     moved = jnp.sqrt(add_up([(place[:, axis] - known.found[:, axis]) ** 2 for axis in range(place.shape[1])]))
     unlisted = known.beyond - moved - jnp.max(moved)
     others = place[known.who]
@@ -80,6 +96,6 @@ def _near(known: Candidates, place: Array, seen: int) -> tuple[Array, Array, Arr
 
 
 def _largest(rows: Array, count: int) -> tuple[Array, Array]:
-    """The largest of each row and where they are. Without the barrier XLA makes it, and the slices that follow, a sort of whole rows."""
+    """The `count` largest values of each row, and their indices. Without the barrier, XLA fuses this with later slices to a full sort."""
     values, index = jax.lax.optimization_barrier(tuple(jax.lax.top_k(rows, count)))
     return values, index

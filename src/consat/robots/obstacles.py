@@ -1,6 +1,7 @@
-"""Obstacles: a public map of discs, boxes and polygons, as convex parts whose nearest points are known in closed form.
+"""Obstacles: a public map of discs, boxes and polygons, split into convex parts with nearest points in closed form.
 
-A polygon is as many segments as it has edges: who is outside and keeps away from each of them stays outside, whether it is convex or not.
+The parts of a polygon are its edges. A robot that starts outside and keeps its distance from every edge stays outside, whether the polygon
+is convex or not.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from consat.errors import Fault, InvalidInput, shown
 from consat.numerics import float64
 
 HALVINGS = 40
-"""To find the point of a robot's segment that is nearest to a part: down to 1e-12 of the segment."""
+"""Bisection steps for the point of a robot's segment that is nearest to a part. The error is about 1e-12 of the segment's length."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Base of obstacles; made by `disc`, `box` and `polygon`.
+    """Base class of obstacles. Use `disc`, `box` or `polygon` to make one.
 
     Attributes:
-        dimension: of the space it lies in.
+        dimension: dimension of the space that it lies in, 2 or 3.
     """
 
     @property
@@ -40,7 +41,7 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Disc(Obstacle):
-    """A disc, or a ball."""
+    """A disc, or a ball in space; see `disc`."""
 
     center: tuple[float, ...]
     radius: float
@@ -52,7 +53,7 @@ class Disc(Obstacle):
 
 @dataclass(frozen=True)
 class Box(Obstacle):
-    """A box whose sides are along the axes."""
+    """An axis-aligned box; see `box`."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -64,7 +65,7 @@ class Box(Obstacle):
 
 @dataclass(frozen=True)
 class Polygon(Obstacle):
-    """A simple polygon, of either orientation."""
+    """A simple polygon, clockwise or counter-clockwise; see `polygon`."""
 
     vertices: tuple[tuple[float, float], ...]
 
@@ -77,8 +78,8 @@ def disc(center: Sequence[float], radius: float) -> Disc:
     """A disc in the plane, or a ball in space.
 
     Args:
-        center: d numbers, m.
-        radius: m, positive.
+        center: (2,) or (3,) centre, m.
+        radius: radius, m, positive.
 
     Raises:
         InvalidInput: one line for each argument that cannot be used.
@@ -92,11 +93,11 @@ def disc(center: Sequence[float], radius: float) -> Disc:
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> Box:
-    """A box between two corners.
+    """An axis-aligned box between two corners.
 
     Args:
-        low: d numbers, m.
-        high: d numbers, m, each above that of `low`.
+        low: (2,) or (3,) lower corner, m.
+        high: upper corner, m, above `low` on every axis.
 
     Raises:
         InvalidInput: one line for each argument that cannot be used.
@@ -116,10 +117,10 @@ def polygon(vertices: Sequence[Sequence[float]]) -> Polygon:
     """A polygon in the plane.
 
     Args:
-        vertices: three points or more, m, in order, either way round; the last one is joined to the first.
+        vertices: (V, 2) at least three points, m, in order, clockwise or counter-clockwise. The last is connected to the first.
 
     Raises:
-        InvalidInput: not points in the plane, fewer than three, a vertex that is given twice, or edges that cross or touch.
+        InvalidInput: the vertices are not points in the plane, are fewer than three, lie on a line or repeat, or edges cross or touch.
     """
     where, path = "obstacle 'polygon', vertices", ("vertices",)
     try:
@@ -145,7 +146,7 @@ def polygon(vertices: Sequence[Sequence[float]]) -> Polygon:
 
 
 def _crossing(points: np.ndarray) -> str:
-    """Which edges of a polygon cross or touch."""
+    """Text of the fault that names two edges which cross or touch."""
     edges = [shapely.LineString([a, b]) for a, b in zip(points, np.roll(points, -1, axis=0), strict=True)]
     count = len(edges)
     for first in range(count):
@@ -181,14 +182,14 @@ class Map:
     """Obstacles as arrays of convex parts, in this order: P₁ discs, P₂ boxes, P₃ edges of polygons.
 
     Attributes:
-        dimension: d.
-        centers: (P₁, d).
-        radii: (P₁,).
-        lows: (P₂, d).
-        highs: (P₂, d).
-        begins: (P₃, 2) of edges.
-        ends: (P₃, 2).
-        polygons: edges of each polygon, as (first, one past the last).
+        dimension: dimension of space, d.
+        centers: (P₁, d) centres of discs, m.
+        radii: (P₁,) radii of discs, m.
+        lows: (P₂, d) lower corners of boxes, m.
+        highs: (P₂, d) upper corners of boxes, m.
+        begins: (P₃, 2) first points of edges, m.
+        ends: (P₃, 2) second points of edges, m.
+        polygons: range of the edges of each polygon, as (first, one past the last).
     """
 
     dimension: int
@@ -202,16 +203,16 @@ class Map:
 
     @property
     def count(self) -> int:
-        """How many parts there are."""
+        """Number of parts, P."""
         return len(self.radii) + len(self.lows) + len(self.begins)
 
     def distances(self, points: Array) -> Array:
-        """(N, P) signed distance from points (N, d) to each part; an edge has no inside."""
+        """(N, P) signed distance from points (N, d) to each part, m; negative inside discs and boxes. An edge has no inside."""
         point = points[:, None]
         rounds = jnp.linalg.norm(point - jnp.asarray(self.centers)[None], axis=2) - jnp.asarray(self.radii)[None]
         outside = jnp.maximum(jnp.asarray(self.lows)[None] - point, point - jnp.asarray(self.highs)[None])
         squared = jnp.sum(jnp.maximum(outside, 0.0) ** 2, axis=2)
-        out = squared > 0.0  # the root has no slope at 0
+        out = squared > 0.0  # the square root has no derivative at 0
         boxes = jnp.where(out, jnp.sqrt(jnp.where(out, squared, 1.0)), jnp.max(outside, axis=2, initial=-jnp.inf))
         parts = [rounds, boxes]
         if len(self.begins):
@@ -219,9 +220,10 @@ class Map:
         return jnp.concatenate(parts, axis=1)
 
     def signed_distance(self, points: Array) -> Array:
-        """(N,) the distance from points (N, d) to the nearest obstacle, negative inside one, infinite where there is none.
+        """(N,) signed distance from points (N, d) to the nearest obstacle, m; negative inside one, infinite without obstacles.
 
-        Its gradient is that of JAX: the unit vector away from the nearest point. Inside polygons are points round which the edges wind.
+        JAX can differentiate it: the gradient is the unit vector away from the nearest point. The inside of a polygon follows the even-odd
+        rule.
         """
         distances = self.distances(points)
         whole = len(self.radii) + len(self.lows)
@@ -232,8 +234,18 @@ class Map:
         return least
 
     def closest(self, start: Array, stop: Array, index: Array) -> tuple[Array, Array]:
-        """(N, k, d) the closest points of the segments [start, stop], (N, d) each, and of their parts (N, k); the second is on the part's
-        surface. The distance to a convex set is convex along the segment, so that halving finds its least."""
+        """Closest points of the robots' segments and of parts.
+
+        The distance to a convex part is convex along a segment, so bisection finds its minimum.
+
+        Args:
+            start: (N, d) start of each robot's segment.
+            stop: (N, d) end of each robot's segment. The same object as `start` means that all segments are points.
+            index: (N, k) the parts for each robot.
+
+        Returns:
+            (N, k, d) points on the segments, and (N, k, d) points on the surfaces of the parts.
+        """
         begin, way = start[:, None], (stop - start)[:, None]
         if stop is start:
             own = jnp.broadcast_to(begin, (*index.shape, start.shape[1]))
@@ -248,12 +260,12 @@ class Map:
             return jnp.where(rising, low, middle), jnp.where(rising, middle, high)
 
         low, high = jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
-        best = jnp.where(low == 0.0, low, high)  # an end that was never left is exact
+        best = jnp.where(low == 0.0, low, high)  # exact where the minimum is at an end of the segment
         own = begin + best[..., None] * way
         return own, self._nearest_on(own, index)
 
     def _nearest_on(self, points: Array, index: Array) -> Array:
-        """(N, k, d) the nearest point of part `index`, (N, k), to each of the points (N, k, d)."""
+        """(N, k, d) point of part `index`, (N, k), that is nearest to each of the points (N, k, d)."""
         rounds, boxes, edges = len(self.radii), len(self.lows), len(self.begins)
         nearest = points
         if rounds:
@@ -280,7 +292,7 @@ class Map:
         return begin + jnp.clip(part, 0.0, 1.0)[..., None] * way
 
     def _inside(self, points: Array, first: int, last: int) -> Array:
-        """(N,) whether a ray to the right crosses the edges an odd number of times."""
+        """(N,) whether points are inside the polygon: a ray to the right crosses its edges `first` to `last` − 1 an odd number of times."""
         x, y = points[:, :1], points[:, 1:2]
         a, b = jnp.asarray(self.begins[first:last]), jnp.asarray(self.ends[first:last])
         crosses = (a[:, 1][None] > y) != (b[:, 1][None] > y)
@@ -290,10 +302,10 @@ class Map:
 
 
 def map_of(obstacles: Sequence[Obstacle], dimension: int) -> Map:
-    """The map of some obstacles in a space of so many dimensions.
+    """Make the map of obstacles for a space of the given dimension.
 
     Raises:
-        InvalidInput: an obstacle of another dimension, or something that is none; one line each.
+        InvalidInput: an entry is not an obstacle, or has another dimension; one line each.
     """
     faults = []
     for index, each in enumerate(obstacles):
@@ -331,7 +343,14 @@ def _off(distance: float) -> str:
 
 @float64
 def start_faults(names: Sequence[str], starts: np.ndarray, size: np.ndarray, obstacles: Map) -> list[Fault]:
-    """What is wrong with starts (N, d) of bodies of these sizes (N,): within an obstacle, or on top of each other."""
+    """Faults of start positions: too near an obstacle, or bodies that overlap.
+
+    Args:
+        names: ids of the N agents, for messages.
+        starts: (N, d) start positions, m.
+        size: (N,) radius that each robot keeps free, m.
+        obstacles: map of the obstacles.
+    """
     from scipy.spatial import cKDTree
 
     faults = []

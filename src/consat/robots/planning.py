@@ -1,8 +1,8 @@
-"""Ways round obstacles, planned on the host by each robot from the public map.
+"""Path planning around obstacles, on the host, for each robot from the public map.
 
-In the plane: a visibility graph between the corners of the obstacles, grown by the body's radius and a clearance, is built once for a map
-(Lozano-Pérez and Wesley, 1979); a path is a shortest path in it. In space: a grid, and its shortest path made straight where nothing is in
-the way. Shortest paths are SciPy's.
+In the plane: a visibility graph between the corners of the obstacles, grown by the body's radius and a clearance (Lozano-Pérez and Wesley,
+1979). It is built once for a map; a path is a shortest path in it. In space: a shortest path in a grid, whose waypoints are left out
+where the straight way is clear. SciPy computes the shortest paths.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from consat.numerics import float64
 from consat.robots.obstacles import Map
 
 CORNERS = 2
-"""Corners of a quarter circle that stands for that of a grown obstacle."""
+"""Segments that approximate a quarter circle of a grown obstacle's outline."""
 CELLS = 40_000
-"""Of the grid in space, at most."""
+"""Most cells of the grid in space, about."""
 TOUCH = 0.999
-"""Part of the size within which nothing may be on a straight way: a robot that slides along a wall, at its size from it, sees its way."""
+"""Fraction of the size that a straight way must keep from obstacles. Below 1, a robot that slides along a wall still has a clear way."""
 SAMPLES = 128
-"""Of a straight way in space, or a multiple of it."""
+"""Number of samples of a straight way in space; of a long way, a multiple of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,9 @@ class Planner:
     """Plans paths for bodies of one size on one map.
 
     Args:
-        obstacles: the map.
-        size: the radius that a robot keeps, m.
-        clearance: how much farther off paths are planned, m; None for a quarter of the size.
+        obstacles: map of the obstacles.
+        size: radius that a robot keeps free, m.
+        clearance: additional distance of planned paths from obstacles, m; None for a quarter of the size.
     """
 
     obstacles: Map
@@ -53,27 +53,29 @@ class Planner:
         object.__setattr__(self, "_roads", roads)
 
     def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """(W, d) waypoints from a start, (d,), to a goal, (d,), which is the last; the goal alone where it can be seen, or where no way
-        leads to it: the safety filter sees to it that nothing is touched."""
+        """(W, d) waypoints from a start, (d,), to a goal, (d,). The last waypoint is the goal.
+
+        The path is the goal alone if the straight way is clear, or if there is no path. The safety filter prevents contact in both cases.
+        """
         return self._roads.path(np.asarray(start, dtype=float), np.asarray(goal, dtype=float))
 
     def paths(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """(N, W, d) as `path`, one for each of N robots, filled up with the goal; W is a power of 2, so that few programs are compiled."""
+        """(N, W, d) one `path` for each of N robots, padded with its goal. W is a power of 2, so that few programs are compiled."""
         found = [self.path(start, goal) for start, goal in zip(starts, goals, strict=True)]
         width = 1 << max(max(map(len, found), default=1) - 1, 0).bit_length()
         return np.stack([np.concatenate([path, np.repeat(path[-1:], width - len(path), axis=0)]) for path in found])
 
     def seen(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """(N,) which straight ways, from (N, d) to (N, d), lead past all obstacles."""
+        """(N,) whether the straight way from each start, (N, d), to its goal, (N, d), is clear of obstacles."""
         return self._roads.seen(starts, goals)
 
     def stale(self, paths: np.ndarray, goals: np.ndarray, tolerance: float) -> bool:
-        """Whether a goal has moved from where its path ends by more than `tolerance`, m."""
+        """Whether any goal, (N, d), is farther than `tolerance`, m, from the end of its path, (N, W, d)."""
         return bool(np.any(np.linalg.norm(paths[:, -1] - goals, axis=1) > tolerance))
 
 
 class _Roads:
-    """Corners of grown obstacles, and which of them see each other."""
+    """Visibility graph of the corners of grown obstacles in the plane."""
 
     def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
         shapes = [
@@ -83,7 +85,7 @@ class _Roads:
         shapes += [shapely.Polygon(obstacles.begins[first:last]) for first, last in obstacles.polygons]
         solid = shapely.union_all(shapes)
         self.walls = shapely.buffer(solid, TOUCH * size, quad_segs=16)
-        # Chords of few corners cut into the circle that they stand for: from farther out they don't.
+        # The chords of a coarse circle cut inside it. A larger radius keeps them outside the true circle.
         reach = (size + clearance) / math.cos(math.pi / (4 * CORNERS))
         grown = shapely.buffer(solid, reach, quad_segs=CORNERS).simplify(0.1 * clearance)
         rings = shapely.get_rings(shapely.get_parts(grown))
@@ -99,7 +101,7 @@ class _Roads:
         self.trees: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def _clear(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Which of the straight ways (M, 2) to (M, 2) lead past all walls."""
+        """(M,) whether the straight way from each point (M, 2) to another (M, 2) is clear of all walls."""
         if len(first) == 0:
             return np.zeros(0, dtype=bool)
         return ~shapely.intersects(self.walls, shapely.linestrings(np.stack([first, second], axis=1)))
@@ -127,7 +129,7 @@ class _Roads:
         return np.array([*way, goal])
 
     def _outside(self, point: np.ndarray) -> np.ndarray:
-        """The point itself, or, of one that is too near an obstacle, the nearest one that is not."""
+        """The point itself, or the nearest point outside the grown obstacles if it is within one."""
         place = shapely.Point(point)
         if not shapely.intersects(self.walls, place):
             return point
@@ -137,13 +139,16 @@ class _Roads:
         return nearest + 1e-6 * away / max(float(np.linalg.norm(away)), 1e-12)
 
     def _seen_from(self, point: np.ndarray) -> np.ndarray:
-        """(V,) the distance to each corner, infinite to those that are not seen."""
+        """(V,) distance to each corner; infinite if the straight way to it is not clear."""
         seen = self._clear(np.broadcast_to(point, self.corners.shape), self.corners)
         return np.where(seen, np.linalg.norm(self.corners - point, axis=1), np.inf)
 
     def _to(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(V,) the length of the shortest way from each corner over one whose last leg has the length `ends`, and (V,) the corner that
-        comes next, −1 for the last."""
+        """Shortest ways from all corners to the goal; `ends`: (V,) length of the last leg from each corner, infinite if it is not clear.
+
+        Returns:
+            (V,) length of the shortest way from each corner, and (V,) the next corner on it, −1 if the goal is next.
+        """
         count = len(ends)
         last = np.flatnonzero(np.isfinite(ends))
         whole = self.graph.tocoo()
@@ -154,7 +159,7 @@ class _Roads:
 
 
 class _Grid:
-    """A grid in space whose free nodes are joined to their 26 neighbours."""
+    """Grid graph in space. Each free node is connected to its free neighbours among the 26 around it."""
 
     def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
         self.signed_distance, self.size = jax.jit(obstacles.signed_distance), size
@@ -191,10 +196,15 @@ class _Grid:
         return np.asarray(self.signed_distance(jnp.asarray(points)))
 
     def _clear(self, first: np.ndarray, second: np.ndarray) -> bool:
-        """Whether a body can go straight; the distance to the nearest obstacle is sampled so finely that it can't be missed by more than
-        an eighth of the size, which paths keep clear."""
+        """Whether the straight way is clear for a body.
+
+        Samples are at most a quarter of the size apart, so that the true smallest distance is at most an eighth of the size smaller than
+        the sampled one.
+        """
         length = float(np.linalg.norm(second - first))
-        samples = SAMPLES * math.ceil((length / (0.25 * self.size) + 1.0) / SAMPLES)  # few sizes, so that few programs are compiled
+        samples = SAMPLES * math.ceil(
+            (length / (0.25 * self.size) + 1.0) / SAMPLES
+        )  # few distinct numbers, so that few programs are compiled
         part = np.linspace(0.0, 1.0, samples)[:, None]
         return bool(np.all(self._distance(first + part * (second - first)) > 1.1 * self.size))
 

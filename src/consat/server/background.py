@@ -1,4 +1,4 @@
-"""Work beside the session's thread, of which only the newest is worth doing."""
+"""Background work for the session's thread. Only the newest request is done."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ T = TypeVar("T")
 
 
 class Background(Generic[T]):
-    """A thread that does the newest of what it is asked for.
+    """A thread that works on the newest request. A new request replaces one that has not begun.
 
     Args:
-        work: what to do.
-        pause: seconds without another request before it begins.
-        longest: seconds that requests can put it off.
-        name: of the thread.
+        work: function to call with a request.
+        pause: time without a further request before the work begins, s.
+        longest: longest time that further requests can delay the work, s. Four times the duration of the last work is added.
+        name: name of the thread.
     """
 
     def __init__(self, work: Callable[[T], None], pause: float, longest: float, name: str) -> None:
@@ -29,7 +29,7 @@ class Background(Generic[T]):
         self._thread.start()
 
     def ask(self, task: T) -> None:
-        """Do this, instead of what has not begun."""
+        """Request work on `task`. It replaces a request that has not begun."""
         with self._change:
             self._last = time.monotonic()
             if not self._asked:
@@ -38,7 +38,7 @@ class Background(Generic[T]):
             self._change.notify()
 
     def close(self) -> None:
-        """Begin nothing more, and wait for what has begun."""
+        """Drop a request that has not begun, and wait, at most 60 s, for work that has."""
         with self._change:
             self._open = False
             self._change.notify()
@@ -57,8 +57,8 @@ class Background(Generic[T]):
             self._took = time.monotonic() - begun
 
     def _wait(self) -> float:
-        """Seconds until it is time."""
+        """Time until the work should begin, s; 0 or less if now. Without a request, positive."""
         if not self._asked:
             return 1.0
-        patience = self._longest + 4.0 * self._took  # what takes long is done more rarely, so that it slows nobody
+        patience = self._longest + 4.0 * self._took  # long work is done less often, so that it does not slow the session
         return min(self._last + self._pause, self._first + patience) - time.monotonic()

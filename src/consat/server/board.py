@@ -1,4 +1,4 @@
-"""The newest of everything that a page is shown. A reader who is late misses what has been replaced; nothing waits for it."""
+"""Latest content of each topic for the web page. Slow readers miss replaced content; writers never wait for readers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from typing import Final
 
 TOPICS: Final = ("scene", "shapes", "outlines", "state", "verdict", "frame")
-"""In the order in which they make sense to a reader."""
+"""All topics, in the order in which a reader needs them."""
 
 
 class Board:
-    """What a session has to show; written by its thread, read by those of the server."""
+    """Latest content of each topic. It is written by the session's thread and read by the server's threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -20,18 +20,22 @@ class Board:
         self._newest: dict[str, tuple[int, str | bytes]] = {}
 
     def put(self, topic: str, content: str | bytes) -> None:
-        """Replace what is shown of a topic."""
+        """Replace the content of a topic."""
         with self._lock:
             self._newest[topic] = next(self._numbers), content
 
     def drop(self, *topics: str) -> None:
-        """Show nothing of some topics any more."""
+        """Remove the content of topics."""
         with self._lock:
             for topic in topics:
                 self._newest.pop(topic, None)
 
     def news(self, seen: dict[str, int]) -> Iterator[str | bytes]:
-        """What a reader has not seen yet; `seen` is kept by the reader and brought up to date."""
+        """Yield the content that a reader has not seen yet.
+
+        Args:
+            seen: number of the last content seen of each topic. The reader keeps it; it is updated here.
+        """
         for topic in TOPICS:
             with self._lock:
                 number, content = self._newest.get(topic, (0, ""))

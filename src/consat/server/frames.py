@@ -1,7 +1,7 @@
-"""A round as bytes: a header of 16 and float32 numbers, little-endian.
+"""Binary format of a round: a header of 16 bytes, then float32 numbers; all little-endian.
 
-The header: kind 1 (uint8), dimension drawn (uint8), 1 where headings follow (uint16), round (uint32), margin (float32), number of the scene
-that the agents are those of (uint32). Then N × d positions, N margins, and N headings in rad if there are any.
+The header: kind, always 1 (uint8); dimensions drawn (uint8); 1 if headings follow, else 0 (uint16); round modulo 2³² (uint32); margin of
+the team (float32); number of the scene that lists the agents (uint32). Then N × d positions, N margins, and N headings, rad, if any.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ KIND: Final = 1
 
 
 def packed(scene: int, round_: int, margin: float, positions: np.ndarray, margins: np.ndarray, headings: np.ndarray | None = None) -> bytes:
-    """A frame.
+    """The bytes of a frame.
 
     Args:
         scene: number of the scene.
-        round_: rounds so far.
-        margin: of the team.
-        positions: (N, d); of more than three dimensions the first three.
-        margins: (N,).
-        headings: (N,) rad, or None.
+        round_: number of rounds so far.
+        margin: margin of the team.
+        positions: (N, d) positions. At most the first three dimensions are sent.
+        margins: (N,) margins of the agents.
+        headings: (N,) headings, rad; None if there are none.
     """
     x = positions[:, :3]
     turned = 0 if headings is None else 1

@@ -1,1 +1,1 @@
-"""What people look at: pure functions of a `consat.results.result.Result`. Nothing here loads matplotlib before a figure is asked for."""
+"""Figures, films, pages and texts from a `consat.results.result.Result`. matplotlib is imported only when a figure is drawn."""

@@ -1,4 +1,4 @@
-"""The formation in motion, as an animated GIF or an MP4 video."""
+"""Film of the formation: an animated GIF or an MP4 video."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from consat.results.result import Result
 from consat.views.scene import Scene, moments
 
 MOVEMENT: Final = 0.75
-"""Share of a film that goes by the way travelled, the rest by the clock: most happens in the first seconds."""
+"""Weight of the distance travelled in the time scale of a film; the rest is the clock. Most motion is in the first seconds of a run."""
 FINE: Final = 121
-"""Points along each side of the view at which ψ is evaluated, in a film."""
+"""Grid points per axis of the view at which ψ is evaluated in a film."""
 FORMATS: Final = (".gif", ".mp4")
 SAMPLES: Final = 24
 """Frames from which the colours of a GIF are chosen."""
@@ -30,17 +30,20 @@ SAMPLES: Final = 24
 def save(
     result: Result, path: str | os.PathLike[str], seconds: float = 8.0, fps: int = 10, *, progress: Callable[[float], None] | None = None
 ) -> Path:
-    """Write the formation in motion.
+    """Write a film of the formation.
 
     Args:
-        result: of a run.
-        path: ends in ``.gif``, or in ``.mp4``, which needs PyAV (``consat[video]``).
-        seconds: how long the film lasts, s; 10 % of it shows the end.
-        fps: frames a second.
-        progress: called with the share that is done, 0 to 1.
+        result: result of a run with recorded positions.
+        path: file to write. It ends in ``.gif``, or in ``.mp4``, which needs PyAV (``consat[video]``).
+        seconds: length of the film, s. The last 10 % show the final formation.
+        fps: frames per second.
+        progress: called after each frame with the fraction that is done, 0 to 1.
+
+    Returns:
+        the path of the file.
 
     Raises:
-        InvalidSettings: another ending, nobody was recorded, or PyAV is not installed.
+        InvalidSettings: the path has another ending, no positions were recorded, or PyAV is not installed.
     """
     target = Path(path)
     suffix = target.suffix.lower()
@@ -61,12 +64,12 @@ def save(
 
 
 def frames(result: Result, count: int, progress: Callable[[float], None] | None = None) -> Iterator[np.ndarray]:
-    """The frames of a film, (height, width, 3) uint8; what doesn't move is drawn once."""
+    """Yield `count` frames of a film, (height, width, 3) uint8. The static background is drawn once; arguments as in `save`."""
     scene = Scene(result, fine=FINE)
     scene.figure.set_dpi(90)
     canvas = FigureCanvasAgg(scene.figure)
     scene.show(scene.last)
-    canvas.draw()  # lays everything out, for good
+    canvas.draw()  # computes the layout, which all frames share
     scene.figure.set_layout_engine("none")
     scene.axes.set_title("")
     for artist in scene.moving:
@@ -91,7 +94,7 @@ def frames(result: Result, count: int, progress: Callable[[float], None] | None 
 
 
 def _gif(target: Path, shown: Sequence[np.ndarray], fps: int) -> None:
-    """One palette for all frames, and a table from a colour's first five bits a channel to its place there."""
+    """Write a GIF with one palette for all frames. A table maps the top five bits of each channel to an index of the palette."""
     some = [shown[k] for k in np.unique(np.linspace(0, len(shown) - 1, SAMPLES).astype(int))]
     palette = Image.fromarray(np.concatenate([each[::2, ::2] for each in some])).quantize(255)
     colours = np.array(palette.getpalette(), dtype=np.uint8).reshape(-1, 3)[:255]
@@ -107,13 +110,13 @@ def _gif(target: Path, shown: Sequence[np.ndarray], fps: int) -> None:
         picture = Image.fromarray(table[short[..., 0] << 10 | short[..., 1] << 5 | short[..., 2]], "P")
         picture.putpalette(colours.tobytes())
         pictures.append(picture)
-    ends = np.round(np.arange(len(shown) + 1) * 100 / fps)  # a GIF counts in 10 ms
+    ends = np.round(np.arange(len(shown) + 1) * 100 / fps)  # durations in a GIF are multiples of 10 ms
     durations = (10 * np.diff(ends)).astype(int).tolist()
     pictures[0].save(target, save_all=True, append_images=pictures[1:], duration=durations, loop=0)
 
 
 def _encoder() -> None:
-    """Raises: InvalidSettings: there is no encoder."""
+    """Raises: InvalidSettings: PyAV is not installed."""
     from importlib.util import find_spec
 
     if find_spec("av") is None:
@@ -121,13 +124,13 @@ def _encoder() -> None:
 
 
 def _mp4(target: Path, shown: Iterator[np.ndarray], fps: int) -> None:
-    """H.264, which every browser and player shows."""
+    """Write H.264, which every browser and player supports."""
     import av
 
     with av.open(str(target), "w") as film:
         stream = None
         for picture in shown:
-            height, width = (side - side % 2 for side in picture.shape[:2])  # the format has even sides only
+            height, width = (side - side % 2 for side in picture.shape[:2])  # the format requires an even width and height
             if stream is None:
                 stream = film.add_stream("libx264", rate=Fraction(fps), options={"crf": "18"})
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

@@ -1,7 +1,7 @@
-"""Where constraints hold, drawn on 2-D axes: what an agent may use is tinted, what it must keep out of is hatched.
+"""Regions of constraints on 2-D axes: allowed regions are tinted, keep-outs are hatched.
 
-A constraint that several agents share is drawn once. Values of ψ on a grid become paths, which the artists take over: nothing is made
-anew from frame to frame.
+A constraint that several agents share is drawn once. Values of ψ on a grid are converted to paths. The artists are created once; each
+frame only replaces their paths.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from consat.views.figures import STYLES, colour
 from consat.views.shapes import BALLS, alike, moves
 
 SHARED: Final = "0.3"
-"""The colour of what several agents share."""
+"""Colour of regions that several agents share."""
 HATCH: Final = "////"
 TINT, SHADE = 0.15, 0.16
 
 
 @dataclass(frozen=True)
 class Area:
-    """Where one constraint holds, or those of several agents that are alike.
+    """Region of one constraint, or of equal constraints of several agents.
 
     Attributes:
-        number: of the (first) constraint.
-        name: of the constraint; the sides of a box have the same.
-        owners: places of those whose constraint it is.
-        keeps_out: whether the forbidden side is the inner one.
-        leaves: whether its boundary leaves the view, so that ticks must tell the forbidden side.
-        moves: whether it moves with teammates.
-        colour: of its boundary.
-        style: of its boundary.
+        number: index of the constraint in the team; of several, the first.
+        name: name of the constraint. The sides of a box have the same name.
+        owners: indices of the agents that have the constraint.
+        keeps_out: whether the forbidden side is the inside.
+        leaves: whether the boundary leaves the view, so that ticks must mark the forbidden side.
+        moves: whether the region moves, with teammates or by a schedule.
+        colour: colour of the boundary.
+        style: line style of the boundary.
     """
 
     number: int
@@ -55,11 +55,11 @@ class Area:
 
 
 def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
-    """The different regions of a team.
+    """The distinct regions of a team.
 
     Args:
         team: the team.
-        values: (M, L, K) every ψ over a grid; without them only library kinds are known to keep out.
+        values: (M, L, K) every ψ on a grid. If None, only library kinds are recognised as keep-outs, and `Area.leaves` is False.
     """
     first, owners, ties, found = alike(team), np.asarray(team.owner), moves(team), []
     kinds = {int(number): family.kind for family in team.families if family.sources is None for number in family.number}
@@ -82,23 +82,23 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
 
 
 def _edge(shape: tuple[int, ...]) -> np.ndarray:
-    """Which points of a grid are on its edge."""
+    """Mask of the points on the border of a grid of this shape."""
     edge = np.ones(shape, dtype=bool)
     edge[(slice(1, -1),) * len(shape)] = False
     return edge
 
 
 class Ground:
-    """The regions of a few agents as artists.
+    """Artists for the regions of a small team.
 
     Args:
-        axes: what to draw on.
+        axes: matplotlib axes to draw on.
         team: the team.
-        found: its `areas`.
-        unit: (2,) the size of the view on each axis, for the length of ticks.
+        found: regions, from `areas`.
+        unit: (2,) size of the view on each axis. The length of ticks is relative to it.
 
     Attributes:
-        artists: those that `show` changes.
+        artists: the artists that `show` changes.
     """
 
     def __init__(self, axes: Any, team: Team, found: Sequence[Area], unit: np.ndarray) -> None:
@@ -109,7 +109,7 @@ class Ground:
         mine: dict[int, set[int]] = {}
         for owner in map(int, np.unique(team.owner)):
             mine[owner] = set(first[np.flatnonzero(team.owner == owner)].tolist())
-            if mine[owner] & closed:  # else all but some holes would be tinted
+            if mine[owner] & closed:  # an agent with keep-outs alone may be almost everywhere: no tint
                 alike_goals.setdefault(frozenset(mine[owner] & closed), []).append(owner)
         self._common: list[tuple[list[int], PathPatch]] = []
         for owners in alike_goals.values():
@@ -125,12 +125,12 @@ class Ground:
         self.artists: list[Artist] = [*common, *self._keep_outs.values(), *self._edges, *self._ticks]
 
     def show(self, across: np.ndarray, up: np.ndarray, values: np.ndarray) -> None:
-        """Draw the regions of all ψ.
+        """Update the artists from the values of all ψ.
 
         Args:
-            across: (K,) coordinates.
-            up: (L,) coordinates.
-            values: (M, L, K) ψ, NaN where not finite.
+            across: (K,) grid coordinates on the horizontal axis.
+            up: (L,) grid coordinates on the vertical axis.
+            values: (M, L, K) weighted ψ, NaN where not finite.
         """
         some = len(across) > 1
         for numbers, patch in self._common:
@@ -145,7 +145,7 @@ class Ground:
 
 
 def _weight(area: Area) -> dict[str, float]:
-    """Goals stand out; what moves with teammates stands back."""
+    """Line width and opacity: regions that move are drawn lighter."""
     return {"linewidth": 1.0, "alpha": 0.65} if area.moves else {"linewidth": 1.4, "alpha": 1.0}
 
 
@@ -156,33 +156,33 @@ def _patch(axes: Any, gid: str, **style: Any) -> PathPatch:
 
 
 def hatched(axes: Any, shade: Any) -> PathPatch:
-    """A keep-out without a path, on axes; the look of keep-outs in every view."""
+    """Add a hatched patch without a path to the axes. All views draw keep-outs with it."""
     patch = _patch(axes, "keep-out", **keep_out_style(shade), zorder=1)
     patch.set_hatch_linewidth(0.7)
     return patch
 
 
 def keep_out_style(shade: Any) -> dict[str, Any]:
-    """How a keep-out is filled: tinted, and hatched in its colour."""
+    """Fill style of a keep-out: a tint and a hatch in the same colour."""
     return {"facecolor": to_rgba(shade, SHADE), "edgecolor": to_rgba(shade, 0.75), "hatch": HATCH, "linewidth": 0.0}
 
 
 def legend_patch(shade: Any, label: str) -> Patch:
-    """The legend's entry for a keep-out."""
+    """Legend entry for a keep-out."""
     patch = Patch(**keep_out_style(shade), label=label)
     patch.set_hatch_linewidth(0.7)
     return patch
 
 
 def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
-    """(K, 2) polylines where values (L, K) are zero, with the higher values on their left; closed ones end where they begin."""
+    """Polylines (P, 2) on which values (L, K) are zero, the higher values on their left. A closed line ends at its first point."""
     if np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
         lines: Any = contour_generator(across, up, np.ma.masked_invalid(values), line_type=LineType.Separate).lines(0.0)
         yield from lines
 
 
 def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
-    """Where values (L, K) are positive."""
+    """Path around the points where values (L, K) are positive."""
     top = float(np.nanmax(values, initial=0.0))
     if top <= 0:
         return Path(np.zeros((0, 2)))
@@ -192,7 +192,7 @@ def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
 
 
 def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
-    """Short strokes that stand on boundaries, on the side where ψ < 0, which is to the right of the lines."""
+    """Short ticks along boundary lines, on the side where ψ < 0: to the right of each line."""
     found = [np.zeros((0, 2, 2))]
     for piece in lines:
         line = piece / unit
@@ -208,7 +208,19 @@ def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
 
 
 def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> list[Artist]:
-    """The boundary of a half-space normal·x ≤ offset in the plane, with ticks on its forbidden side."""
+    """Draw the boundary of a half-space normal·x ≤ offset in the plane, with ticks on its forbidden side.
+
+    Args:
+        axes: matplotlib axes to draw on.
+        low: (2,) lower corner of the view.
+        high: (2,) upper corner of the view.
+        normal: (2,) unit vector towards the forbidden side.
+        offset: distance of the boundary from the origin, along `normal`.
+        shade: colour.
+
+    Returns:
+        the artists: the line and its ticks.
+    """
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     foot = middle - (middle @ normal - offset) * normal
     along = np.array([-normal[1], normal[0]]) * size

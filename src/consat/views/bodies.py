@@ -1,4 +1,4 @@
-"""Robots and obstacles as they are drawn: bodies of true size that look where they look, and what stands in their way."""
+"""Drawing of robots and obstacles: bodies to scale, with their headings, and the obstacles of the map."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from consat.robots.description import Robots
 from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
 
 SOLID: Final = "0.62"
-"""The colour of obstacles: solid grey, as nothing else is; keep-outs are hatched."""
+"""Colour of obstacles. Only obstacles are solid grey; keep-outs are hatched."""
 EDGE: Final = "0.25"
 AROUND: Final = np.linspace(0, 2 * np.pi, 25)
 SIDES: Final = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
-"""Of a box in space the corners of each side; corner k is high on the axes whose bit of k, the first axis' first, is set."""
+"""(6, 4) corner numbers of each side of a box in space. Bits 4, 2, 1 of a number say whether the corner is high on axis 0, 1, 2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """The bodies of the recorded agents.
+    """Bodies of the recorded agents.
 
     Attributes:
-        radius: (N,).
-        offset: (N,) how far a body's middle is behind the recorded position, along its heading.
-        heading: (T, N) which way they look, rad; None where no heading was recorded.
-        turns: (N,) whether the heading means anything.
+        radius: (N,) radius of each body, m.
+        offset: (N,) distance of the body's centre behind the recorded position, along the heading, m.
+        heading: (T, N) headings, rad; None if they were not recorded.
+        turns: (N,) whether the agent has a heading.
     """
 
     radius: np.ndarray
@@ -44,11 +44,11 @@ class Bodies:
     turns: np.ndarray
 
     def middle(self, x: np.ndarray, ahead: np.ndarray | None) -> np.ndarray:
-        """(…, N, d) the middles of bodies.
+        """(…, N, d) centres of the bodies.
 
         Args:
             x: (…, N, d) recorded positions.
-            ahead: (…, N, 2) unit vectors, as `ahead` gives them.
+            ahead: (…, N, 2) unit vectors along the headings, as `ahead` returns them; None for bodies centred on their positions.
         """
         if ahead is None:
             return x
@@ -57,7 +57,7 @@ class Bodies:
         return x - behind
 
     def ahead(self, moment: float) -> np.ndarray | None:
-        """(N, 2) unit vectors along the headings at a moment, between two samples the shorter way round."""
+        """(N, 2) unit vectors along the headings at a moment, a sample index that may be fractional. Angles turn the shorter way round."""
         if self.heading is None:
             return None
         first, last = self.heading[int(moment)], self.heading[int(np.ceil(moment))]
@@ -66,7 +66,7 @@ class Bodies:
 
 
 def machines(result: Result) -> Robots | None:
-    """The robots and the obstacles of a run, as its summary has them; None if its agents were points."""
+    """The robots and the obstacles in the summary of a run; None if the run had no robot layer."""
     told = result.summary.get("robots")
     if told is None:
         return None
@@ -75,7 +75,7 @@ def machines(result: Result) -> Robots | None:
 
 
 def bodies(result: Result, data: Any) -> Bodies | None:
-    """The bodies of the agents in a record, an `xarray.Dataset` of the result."""
+    """The bodies of the agents in `data`, an `xarray.Dataset` of the result; None if the run had no robot layer."""
     known = machines(result)
     if known is None:
         return None
@@ -85,20 +85,20 @@ def bodies(result: Result, data: Any) -> Bodies | None:
 
 
 def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) radius of the body of each agent, and (N,) how far its middle is behind its position, along its heading."""
+    """(N,) radius of each agent's body, m, and (N,) distance of its centre behind the agent's position, along the heading, m."""
     models = [known.own.get(name, known.common) for name in ids]
     radius, offset = ([float(np.max(getattr(model, name, 0.0))) for model in models] for name in ("radius", "offset"))
     return np.array(radius, dtype=float), np.array(offset, dtype=float)
 
 
 def obstacles(result: Result) -> tuple[Obstacle, ...]:
-    """The obstacles of a run."""
+    """The obstacles of a run; empty if it had no robot layer."""
     known = machines(result)
     return () if known is None else known.obstacles
 
 
 def bounds(found: Sequence[Obstacle], axes: int) -> np.ndarray:
-    """(B, 2, axes) the boxes around obstacles."""
+    """(B, 2, axes) bounding boxes of obstacles, low and high corner, on the first axes."""
     boxes = [np.stack(_bounds(each))[:, :axes] for each in found]
     return np.stack(boxes) if boxes else np.zeros((0, 2, axes))
 
@@ -113,7 +113,7 @@ def _bounds(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray]:
 
 
 def outline(obstacle: Obstacle) -> Path:
-    """An obstacle in the plane."""
+    """Outline of an obstacle in the plane."""
     if isinstance(obstacle, Disc):
         return Path.circle((obstacle.center[0], obstacle.center[1]), obstacle.radius)
     if isinstance(obstacle, Box):
@@ -126,13 +126,13 @@ def outline(obstacle: Obstacle) -> Path:
 
 
 def map_in_plane(axes: Any, found: Sequence[Obstacle]) -> None:
-    """Draw obstacles: solid grey."""
+    """Draw obstacles of the plane, solid grey."""
     for each in found:
         axes.add_artist(PathPatch(outline(each), facecolor=SOLID, edgecolor=EDGE, linewidth=1.2, zorder=0.9, gid="obstacle"))
 
 
 def map_in_space(axes: Any, found: Sequence[Obstacle]) -> None:
-    """Draw balls and boxes: solid grey."""
+    """Draw obstacles of space (balls and boxes), solid grey."""
     for each in found:
         if isinstance(each, Disc):
             axes.plot_surface(*_ball(np.array(each.center), each.radius), color=SOLID, alpha=0.9, linewidth=0, zorder=1, gid="obstacle")
@@ -143,7 +143,7 @@ def map_in_space(axes: Any, found: Sequence[Obstacle]) -> None:
 
 
 def balls(axes: Any, middle: np.ndarray, radius: np.ndarray, shades: Sequence[Any]) -> list[Artist]:
-    """Bodies in space, (N, 3), as balls."""
+    """Draw bodies in space as balls: centres (N, 3), radii (N,), one colour each."""
     return [
         axes.plot_surface(*_ball(at, size), color=shade, linewidth=0, zorder=4, gid="body")
         for at, size, shade in zip(middle, radius, shades, strict=True)
@@ -151,19 +151,19 @@ def balls(axes: Any, middle: np.ndarray, radius: np.ndarray, shades: Sequence[An
 
 
 def _ball(center: np.ndarray, radius: float) -> np.ndarray:
-    """(3, K, L) points on a sphere."""
+    """(3, K, L) grid of points on a sphere."""
     longitude, latitude = np.meshgrid(AROUND, AROUND[: len(AROUND) // 2 + 1], indexing="ij")
     sphere = np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
     return np.asarray(center[:, None, None] + radius * sphere)
 
 
 class Crew:
-    """Bodies in the plane as artists: discs, and a stroke from the middle of each to where it looks.
+    """Artists for bodies in the plane: a disc for each, and a stroke from its centre along its heading.
 
     Args:
-        axes: to draw on.
+        axes: matplotlib axes to draw on.
         found: the bodies.
-        shades: (N,) their colours; None if `paint` tells.
+        shades: (N,) colours; None if `paint` sets them later.
     """
 
     def __init__(self, axes: Any, found: Bodies, shades: Sequence[Any] | None) -> None:
@@ -180,11 +180,11 @@ class Crew:
         self.artists: list[Artist] = [self._discs, self._strokes]
 
     def paint(self, shades: Any) -> None:
-        """Give every body its colour."""
+        """Set the colours of the bodies."""
         self._discs.set_facecolor(shades)
 
     def show(self, x: np.ndarray, moment: float) -> None:
-        """Put the bodies where they are at a moment; x: (N, 2) the recorded positions then."""
+        """Move the artists to a moment, a sample index that may be fractional; x: (N, 2) recorded positions at that moment."""
         found, ahead = self._found, self._found.ahead(moment)
         middle = found.middle(x, ahead)
         self._discs.set_offsets(middle)
@@ -195,7 +195,7 @@ class Crew:
 
 
 def legend(found: Bodies | None, stand: Sequence[Obstacle]) -> list[Any]:
-    """What the legend says of robots and obstacles."""
+    """Legend entries for robots and obstacles."""
     entries: list[Any] = []
     if found is not None:
         style: dict[str, Any] = {"marker": "o", "markersize": 11, "markerfacecolor": "0.85", "markeredgecolor": EDGE, "linestyle": ""}

@@ -1,4 +1,4 @@
-"""Colours that the colour-blind can tell apart: of lines, of regions, and a scale of margins."""
+"""Colours that colour-blind readers can tell apart: for lines, for regions, and a colour scale for margins."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from matplotlib import colormaps
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 
 LINK: Final = "#4d5663"
-"""Links are dark and thin, …"""
+"""Colour of links: dark. They differ from paths in lightness, so that every reader can tell them apart."""
 TRAIL: Final = "#dccaa4"
-"""… paths of a crowd light and broad: they differ in lightness, whatever colours a reader sees."""
+"""Colour of the paths of many agents: light."""
 AREA: Final = (0.0, 0.447, 0.698)
 CLASSES: Final = 4
-"""Of margins on either side of zero: each holds as many agents."""
+"""Number of margin classes on each side of zero. Each class holds about the same number of agents."""
 
 
 def classes(margins: np.ndarray) -> tuple[Colormap, BoundaryNorm, np.ndarray, Literal["neither", "min", "max"]]:
-    """A scale for margins whose steps each hold as many agents, so that it is used as a whole, whatever outliers there are.
+    """Colour scale for margins by quantiles. Outliers don't compress the rest of the scale.
 
     Args:
-        margins: (N,); those that are not finite count for nothing.
+        margins: (N,) margins of the agents. Values that are not finite are ignored.
 
     Returns:
-        colours (reds for violated, blues for satisfied, grey for none), the norm, the edges of the steps, zero among them, and on which
-        side a colour bar needs an end of the sign that nobody has.
+        the colour map (reds for violated, blues for satisfied, grey where not finite), the norm, the class edges, with zero among them,
+        and the argument `extend` of the colour bar: the side without agents, if one sign does not occur.
     """
     finite = margins[np.isfinite(margins)]
     bad, good = finite[finite <= 0], finite[finite > 0]
@@ -46,7 +46,7 @@ def classes(margins: np.ndarray) -> tuple[Colormap, BoundaryNorm, np.ndarray, Li
 
 
 def _short(value: float) -> float:
-    """With two digits, away from zero."""
+    """The value rounded to two significant digits, away from zero."""
     if value == 0:
         return 0.0
     digit = 10.0 ** (np.floor(np.log10(abs(value))) - 1)

@@ -1,7 +1,7 @@
-"""The figures of a run, as the paper shows it: formation, margins, estimates, integral states.
+"""Figures of a run, as in the paper: formation, margins, estimates, integral states.
 
-Regions are drawn for any ψ alike, library kind, expression or own function: ψ is evaluated with its owner moved over a grid
-and everyone else where they are, so its line is where the constraint starts to hold for its owner, as the others stand.
+Regions are drawn in the same way for every ψ (library kind, expression or own function): ψ is evaluated with its owner at the points of a
+grid and all other agents at their positions. The line ψ = 0 is the boundary of the region in which the constraint holds for its owner.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which the colour-blind can tell apart, without the yellow, which nobody sees on white."""
+"""Colours of Okabe and Ito, which colour-blind readers can tell apart. Their yellow is left out: it is hard to see on white."""
 MARKERS = ("o", "s", "^", "D", "v", "<", ">")
 STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
 GREY = "0.45"
@@ -42,30 +42,30 @@ VERDICTS: Mapping[str, Mapping[str, Any]] = {
     "infeasible": {"facecolor": "#D55E00", "edgecolor": "white", "hatch": "xxx"},
     "undecided": {"facecolor": "0.85", "edgecolor": "0.45", "hatch": "..."},
 }
-"""The looks of verdicts over time; they differ in hatching, too."""
+"""Style of each verdict over time. The hatches differ as well as the colours."""
 DPI = 150
 BATCH = 8192
 FAR = 6.0
-"""Paths that would make the view this many times wider are cut, so that the formation stays visible."""
+"""Paths are cut where they would make the view more than this factor wider, so that the formation stays visible."""
 MOST_NUMBERS = 10_000_000
-"""Of a longer record some steps are drawn, evenly spread."""
+"""Most numbers of a record that are drawn. A larger record is thinned to evenly spaced steps."""
 MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 120, 12, 60
 MOST_HELD = 12
-"""Of copies held by, or of, more agents than this their spread is drawn; likewise where they would be more than `MOST_CURVES` curves."""
+"""Most agents for which every copy is drawn as a curve. With more agents, or more than `MOST_CURVES` curves, quantile bands are drawn."""
 
 
 def colour(agent: int) -> str:
-    """The colour of an agent, the same in every figure."""
+    """Colour of an agent (index in the team), the same in every figure."""
     return COLOURS[agent % len(COLOURS)]
 
 
 def marker(agent: int) -> str:
-    """The marker of an agent; where the colours repeat, the markers differ."""
+    """Marker of an agent (index in the team). Agents with the same colour have different markers."""
     return MARKERS[(agent + agent // len(COLOURS)) % len(MARKERS)]
 
 
 def plain(text: str, longest: int = 34) -> str:
-    """A name as matplotlib should show it: short, and its dollars are no mathematics."""
+    """A name as text for matplotlib: shortened to `longest` characters, with dollar signs escaped, which else begin a formula."""
     return (text if len(text) <= longest else text[: longest - 1] + "…").replace("$", r"\$")
 
 
@@ -79,19 +79,19 @@ def _over(psi: Callable[..., Any], points: Any, arguments: Any, slot: Any, param
 
 @float64
 def regions(team: Team, x: np.ndarray, points: np.ndarray, families: Sequence[Family] | None = None) -> np.ndarray:
-    """How well each constraint holds for its owner at other places, as the others stand.
+    """Evaluate each ψ with its owner moved to other points and all other agents at their positions.
 
     Args:
         team: the team.
-        x: (N, d) everyone's positions.
-        points: (K, p) where to put the owner instead, on its first p ≤ d axes.
-        families: of which constraints, if not all.
+        x: (N, d) positions of all agents.
+        points: (K, p) points for the owner. They replace its first p ≤ d coordinates.
+        families: families of the constraints to evaluate; None for all.
 
     Returns:
-        (M, K) the weighted ψ of every constraint, in the team's order; NaN where it is not finite, and for those that were not asked for.
+        (M, K) weighted ψ of every constraint, in the team's order; NaN where it is not finite, and for constraints not in `families`.
     """
     count = len(points)
-    batches = np.resize(points, (-(-count // BATCH), BATCH, points.shape[1]))  # all of one size, so that ψ is compiled once
+    batches = np.resize(points, (-(-count // BATCH), BATCH, points.shape[1]))  # batches of equal size, so that ψ is compiled once
     values = np.full((len(team.owner), batches.shape[0] * BATCH), np.nan)
     for family in team.families if families is None else families:
         slot = np.argmax(family.agents == family.owner[:, None], axis=1)
@@ -104,13 +104,13 @@ def regions(team: Team, x: np.ndarray, points: np.ndarray, families: Sequence[Fa
 
 
 def grid(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(p, count) coordinates along each axis of a box, and the (count^p, p) points of the grid they make."""
+    """Grid in a box with corners `low` and `high`, (p,): (p, count) coordinates along each axis, and (count^p, p) grid points."""
     along = np.linspace(low, high, count, axis=-1)
     return along, np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(low))
 
 
 def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Number and box, (2, p), of every region, or obstacle, that lies within a box."""
+    """Index and bounding box, (2, p), of every region ψ > 0, or forbidden region ψ < 0, that lies inside the given box."""
     count = {1: 401, 2: 81, 3: 31}[len(low)]
     along, points = grid(low, high, count)
     for k, values in enumerate(regions(team, x, points).reshape(-1, *(count,) * len(low))):
@@ -121,17 +121,23 @@ def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ite
 
 
 def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, bool]:
-    """The box to show, low and high, of the paths (T, N, p) to a formation at x (N, d), and whether it leaves starts out.
+    """The box to show. It holds the final formation, the regions, and the paths if they don't start far away (`FAR`).
 
-    It holds the formation, its regions, and the paths unless they come from far. Where `team` is None, the regions are those within
-    `boxes` (B, 2, p).
+    Args:
+        paths: (T, N, p) positions over time, on the axes shown; the last is the final formation.
+        x: (N, d) final positions on all axes.
+        team: team whose regions are found by sampling; None if `boxes` already holds them.
+        boxes: (B, 2, p) further boxes that the view should hold, low and high corner.
+
+    Returns:
+        low and high corner of the view, (p,) each, and whether it cuts off the beginning of paths.
     """
-    everywhere, core = paths[np.isfinite(paths).all(axis=2)], paths[-1]  # who joined later was nowhere before
+    everywhere, core = paths[np.isfinite(paths).all(axis=2)], paths[-1]  # an agent that joined later has no position before
     middle = (core.min(axis=0) + core.max(axis=0)) / 2
     half = max(float(np.ptp(core, axis=0).max()), 1e-3 * float(np.ptp(everywhere, axis=0).max())) or 1e-3
     count = 0 if team is None else len(team.owner)
     missing = set(range(count))
-    for factor in 4.0 ** np.arange(12):  # ever wider, until every region has been seen
+    for factor in 4.0 ** np.arange(12):  # widen the search until every region was found
         for k, box in _sights(team, x, middle - factor * half, middle + factor * half) if team is not None and missing else ():
             if k in missing and (len(missing) == count or np.ptp(box, axis=0).max() <= FAR * np.ptp(core, axis=0).max()):
                 core = np.concatenate([core, box])
@@ -143,13 +149,13 @@ def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray 
     cut = bool(np.ptp(both, axis=0).max() > FAR * np.ptp(core, axis=0).max() > 0)
     low, high = (core if cut else both).min(axis=0), (core if cut else both).max(axis=0)
     side = float((high - low).max()) or 1.0
-    least = 0.75 if len(low) < 3 else 0.5  # of the longest side of the view, the others
+    least = 0.75 if len(low) < 3 else 0.5  # the least length of the other sides, relative to the longest side
     spare = np.maximum(0.0, least * side - (high - low)) / 2 + (0.35 if cut else 0.08) * side
     return low - spare, high + spare, cut
 
 
 def recorded(result: Result) -> xr.Dataset:
-    """What was recorded of a run; of a very long record some steps, evenly spread, and the last."""
+    """The record of a run. A very long record is thinned to evenly spaced steps, first and last included."""
     data = result.data
     clock = str(data["margin"].dims[0])
     count, row = data.sizes[clock], sum(math.prod(data[name].shape[1:]) for name in data.data_vars if clock in data[name].dims)
@@ -158,18 +164,18 @@ def recorded(result: Result) -> xr.Dataset:
 
 
 def formation(result: Result, axes: Any = None) -> Figure | None:
-    """Paths from start (open) to end (filled), and where each constraint holds for its owner, as the others stand in the end.
+    """Figure of the formation: paths from start (open marker) to end (filled marker), and the region of each constraint at the end.
 
     Args:
-        result: of a run.
-        axes: what to draw on, 3-D axes for a team in space; if None, a new figure.
+        result: result of a run.
+        axes: matplotlib axes to draw on, 3-D axes for a team in space; None for a new figure.
 
     Returns:
-        None if nobody was recorded.
+        the figure; None if no positions were recorded.
     """
     if "position" not in result.data:
         return None
-    from consat.views.scene import Scene  # a still is the last moment of a film
+    from consat.views.scene import Scene  # the figure is the last moment of the film
 
     scene = Scene(result, axes)
     scene.show(scene.last)
@@ -178,8 +184,11 @@ def formation(result: Result, axes: Any = None) -> Figure | None:
 
 
 def margins(result: Result) -> Figure:
-    """The margin β̄, from when on every constraint holds, and between what the best margin is proven to lie; and the bound that the agents
-    themselves have proven, where they do, else the smooth margin β."""
+    """Figure of the margin β̄ over time or rounds.
+
+    It also shows the time from which on every constraint holds, and the proven interval of the best margin. The second curve is the upper
+    bound that all agents have proven, if the protocol gives one; else the smooth margin β.
+    """
     data, summary = recorded(result), result.summary
     figure, axes, clock = _chart(result, "margin of the team", "margin", timed=True)
     along = seconds(result, data[str(data["margin"].dims[0])].values.astype(float)) if clock == "time" else data[clock].values
@@ -196,7 +205,7 @@ def margins(result: Result) -> Figure:
     axes.margins(y=0.08)
     _stretch(axes, *(data[name].values for name, *_ in curves))
     verdicts = summary.get("verdicts")
-    lower, upper = (summary.get("bounds") or (None, None)) if not verdicts else (None, None)  # of a team that moves they hold at the end
+    lower, upper = (summary.get("bounds") or (None, None)) if not verdicts else (None, None)  # of moving constraints: the end only
     if lower is not None and upper is not None:
         proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
         axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
@@ -212,7 +221,7 @@ def margins(result: Result) -> Figure:
 
 
 def _chart(result: Result, title: str, ylabel: str, *, timed: bool = False) -> tuple[Figure, Axes, str]:
-    """A figure, its axes over the time, or the rounds, of a run, and which of the two; timed: the time wherever rounds take some."""
+    """A figure, its axes, and their horizontal unit, ``time`` or ``round``. `timed`: use time if the rounds have a duration."""
     figure = Figure(figsize=(8.4, 4.8), layout="constrained")
     axes = figure.add_subplot(title=f"{plain(result.summary['scenario'])}: {title}", ylabel=ylabel)
     clock = str(result.data["margin"].dims[0])
@@ -227,7 +236,7 @@ def _chart(result: Result, title: str, ylabel: str, *, timed: bool = False) -> t
 
 
 def _band(axes: Axes, verdicts: Sequence[Mapping[str, Any]]) -> list[Patch]:
-    """Draw verdicts over time as a band under a chart, each named where there is room; returns what the legend says of them."""
+    """Draw verdicts over time as a band below a chart, labelled where there is room. Returns the legend entries."""
     band = axes.inset_axes((0.0, -0.26, 1.0, 0.07), sharex=axes)
     first, last = axes.get_xlim()
     for each in verdicts:
@@ -243,7 +252,7 @@ def _band(axes: Axes, verdicts: Sequence[Mapping[str, Any]]) -> list[Patch]:
 
 
 def _stretch(axes: Axes, *curves: np.ndarray) -> None:
-    """A scale that shows the end of the run beside a beginning many times larger: linear around zero, logarithmic beyond."""
+    """If the curves begin much larger than they end, set a vertical scale that shows both: linear around zero, logarithmic beyond."""
     finite = [np.abs(curve[np.isfinite(curve)]) for curve in curves]
     largest = max((float(curve.max()) for curve in finite if len(curve)), default=0.0)
     end = max((float(curve[-1]) for curve in finite if len(curve)), default=0.0)
@@ -260,12 +269,12 @@ def _stretch(axes: Axes, *curves: np.ndarray) -> None:
 
 
 def seconds(result: Result, steps: np.ndarray) -> np.ndarray:
-    """The times, s, of recorded steps; of rounds that take no time their numbers."""
+    """Times, s, of recorded steps. If rounds have no duration, the round numbers."""
     return steps * (period(result) or 1.0)
 
 
 def period(result: Result) -> float | None:
-    """How long a step of the record's clock lasts, s; None if nobody says, as of rounds that take no time."""
+    """Duration of one unit of the record's clock, s; None if rounds have no known duration."""
     clock = str(result.data["margin"].dims[0])
     last, motion, verdicts = float(result.data[clock].values[-1]), result.summary.get("motion"), result.summary.get("verdicts")
     duration = motion["duration"] if motion else verdicts[-1]["to"] if verdicts else None
@@ -273,24 +282,26 @@ def period(result: Result) -> float | None:
 
 
 def label(what: str, unit: str | None) -> str:
-    """The label of an axis: what it shows, with the unit if one is given."""
+    """Label of an axis: the quantity, and the unit if there is one."""
     return what if unit is None else f"{what} [{plain(unit)}]"
 
 
 def number(value: float) -> str:
-    """A number for people: three digits, or the whole ones of thousands, and a real minus."""
+    """Format a number for display: three digits, an integer from 1000 to 10⁶, and a true minus sign."""
     return (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
 
 
 def estimates(result: Result) -> Figure | None:
-    """What the agents think where everyone is: a colour for each coordinate, a line style for each holder; of many, how wrong they are.
-    None if it was not recorded."""
+    """Figure of the agents' estimates of positions: one colour per coordinate, one line style per holder.
+
+    For many copies, quantile bands of the estimation error. None if the estimates were not recorded.
+    """
     unit = None if result.team is None else result.team.unit
     return _copies(result, "estimate", "estimates of the positions", label("estimate", unit))
 
 
 def integrals(result: Result) -> Figure | None:
-    """The integral states, encoded as the estimates; of many, how large they are. None if they were not recorded."""
+    """Figure of the integral states, drawn as the estimates. For many copies, bands of their norms. None if they were not recorded."""
     return _copies(result, "integral", "integral states", "integral state z")
 
 
@@ -324,7 +335,7 @@ def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None
 
 
 def _spread(result: Result, data: xr.Dataset, name: str, title: str) -> Figure:
-    """Of many copies how large they are, or of estimates how wrong, as bands over all copies."""
+    """Quantile bands over all copies: of their norms or, for estimates, of the estimation errors."""
     values, what, unit = data[name].values, f"size of the {title}", None
     ids = {str(agent): i for i, agent in enumerate(data["agent"].values)} if "agent" in data.coords else {}
     known = [copy for copy, held in enumerate(data["held"].values) if str(held) in ids]
@@ -332,7 +343,7 @@ def _spread(result: Result, data: xr.Dataset, name: str, title: str) -> Figure:
         team = result.team
         what, unit = "distance of the estimate from the position", None if team is None else team.unit
         place = [ids[str(data["held"].values[copy])] for copy in known]
-        of_others = data["holder"].values != data["held"].values  # nobody errs about oneself
+        of_others = data["holder"].values != data["held"].values  # an agent knows its own position: no error
         others = [j for j, copy in enumerate(known) if of_others[copy]]
         values = (values[:, known] - data["position"].values[:, place])[:, others or slice(None)]
     sizes = np.linalg.norm(values, axis=2)
@@ -352,12 +363,12 @@ def _spread(result: Result, data: xr.Dataset, name: str, title: str) -> Figure:
 
 
 def _sample(count: int, most: int) -> list[int]:
-    """At most so many of so many places, evenly spread."""
+    """At most `most` evenly spaced indices out of `count`."""
     return [int(place) for place in np.linspace(0, count - 1, min(count, most))]
 
 
 def _shades(agents: int, dimension: int) -> np.ndarray:
-    """(N, d, 3) a colour for each coordinate: of the agent's colour a shade for each axis; of many agents the whole of a colour map."""
+    """(N, d, 3) a colour for each coordinate: shades of the agent's colour; for many agents, colours of one colour map."""
     if agents > len(COLOURS):
         return mpl.colormaps["viridis"](np.linspace(0, 0.95, agents * dimension))[:, :3].reshape(agents, dimension, 3)
     base = np.array([to_rgb(colour(i)) for i in range(agents)])[:, None]
@@ -366,7 +377,7 @@ def _shades(agents: int, dimension: int) -> np.ndarray:
 
 
 def save(result: Result, directory: str | os.PathLike[str]) -> list[Path]:
-    """Write formation.png, margins.png and, where recorded, estimates.png and integrals.png into a directory, made if need be."""
+    """Write formation.png, margins.png and, if recorded, estimates.png and integrals.png into a directory. Returns the paths."""
     target = Path(directory)
     target.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -377,7 +388,7 @@ def save(result: Result, directory: str | os.PathLike[str]) -> list[Path]:
 
 
 def show(result: Result) -> list[Path]:
-    """Show the figures in windows, or in the notebook, and wait until they are closed; there are no files, so the list is empty."""
+    """Show the figures in windows, or in the notebook, and wait until they are closed. The list of files is empty."""
     from matplotlib import pyplot
     from matplotlib.backends.registry import BackendFilter, backend_registry
 

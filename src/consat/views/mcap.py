@@ -1,8 +1,8 @@
-"""A run as an MCAP file, which Foxglove and other tools of robotics open.
+"""Export of a run to an MCAP file, which Foxglove and other robotics tools open.
 
 Topics, all in the frame ``world``: ``/agents`` foxglove.PointCloud with the fields x, y, z, margin; ``/tf`` a frame for each agent;
-``/scene`` foxglove.SceneUpdate with regions, keep-outs, links and names; ``/margin`` the numbers of the team, to plot;
-``/agent_margins`` those of each agent, of teams that are not large.
+``/scene`` foxglove.SceneUpdate with regions, keep-outs, links and names; ``/margin`` the margin of the team, to plot;
+``/agent_margins`` the margin of each agent. ``/tf`` and ``/agent_margins`` are left out for large teams.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 WORLD: Final = "world"
 ROUND: Final = 0.1
-"""Seconds that a round takes in the file, where rounds take no time."""
+"""Duration of a round in the file, s, for runs whose clock is rounds."""
 MOST_NAMED, MOST_SHAPES, MOST_NUMBERS = 200, 2_000, 10_000_000
 THIN: Final = 0.02
-"""Height of discs in the plane, of their radius."""
+"""Height of discs in the plane, relative to their radius."""
 KEEP_OUT: Final = (0.3, 0.3, 0.3)
 LINK: Final = (0.45, 0.5, 0.57)
 
@@ -40,8 +40,11 @@ def save(result: Result, path: str | os.PathLike[str]) -> Path:
     """Write the file.
 
     Args:
-        result: of a run whose positions were recorded.
-        path: ends in ``.mcap``.
+        result: result of a run with recorded positions.
+        path: file to write; ends in ``.mcap``.
+
+    Returns:
+        the path of the file.
 
     Raises:
         InvalidSettings: foxglove-sdk is not installed.
@@ -95,7 +98,7 @@ def _schema(names: list[str]) -> dict[str, Any]:
 
 
 def _in_space(x: np.ndarray) -> np.ndarray:
-    """Positions or points (…, d) with three coordinates: the first three, or zeros for those that are missing."""
+    """Points (…, d) with exactly three coordinates: the first three, or padded with zeros."""
     missing = max(0, 3 - x.shape[-1])
     return np.concatenate([x[..., :3], np.zeros((*x.shape[:-1], missing))], axis=-1)
 
@@ -129,7 +132,7 @@ def _vector(place: np.ndarray) -> Any:
 
 
 class _Scene:
-    """Regions, links and names; what stands still is told once, at the first step."""
+    """Entities of ``/scene``: regions, links and names. Entities that don't move are written once, at the first step."""
 
     def __init__(self, team: Team | None, ids: list[str], x: np.ndarray, times: np.ndarray, dimension: int) -> None:
         self._times = times
@@ -146,7 +149,7 @@ class _Scene:
             self._moves = moves(team)
 
     def entities(self, k: int, stamp: Any) -> Iterator[SceneEntity]:
-        """What is new at a step."""
+        """The entities to write at step k."""
         x = self._x[k]
         if self._shapes is not None and self._team is not None:
             time = float(self._times[k])

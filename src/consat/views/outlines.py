@@ -1,4 +1,4 @@
-"""The boundaries of ψ whose geometry cannot be read off, as polylines: for views outside matplotlib."""
+"""Boundaries of ψ without closed-form geometry, traced as polylines, for views outside matplotlib."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from consat.views.figures import grid, regions
 
 FINE = 81
 MOST = 40
-"""Constraints of which boundaries are traced; of more, none."""
+"""Most constraints whose boundaries are traced. If there are more, none is."""
 
 
 def outlines(team: Team, numbers: Sequence[int], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[list[np.ndarray]]:
-    """Where ψ = 0 for the owner, as the others stand, on the first two axes.
+    """Trace ψ = 0 on the first two axes, with the owner moved and all other agents at their positions.
 
     Args:
         team: the team.
-        numbers: which constraints.
-        x: (N, d) where everybody is.
-        low: (2,) corner of the view.
-        high: (2,) its other corner.
+        numbers: indices of the constraints.
+        x: (N, d) positions of all agents.
+        low: (2,) lower corner of the view.
+        high: (2,) upper corner of the view.
 
     Returns:
-        of each constraint its boundary, polylines (K, 2), the side where ψ > 0 on their left.
+        for each constraint the polylines (K, 2) of its boundary, with the side ψ > 0 on their left.
     """
     along, points = grid(low, high, FINE)
     chosen = [family for family in team.families if np.isin(family.number, numbers).any()]

@@ -1,7 +1,7 @@
-"""What a page draws of a team, as plain data: balls, half-spaces and traced boundaries, and the box that holds them all.
+"""Data of a team for the scripts of the web pages: balls, half-spaces, and the box that holds them.
 
-The pages' script knows a ball as ``{center, around, radius, out, owners, names}``, a wall as ``{corners, normal, offset, owners, names,
-place}``. Owners are places in the team; of each owner the name of its constraint is given.
+A ball is ``{center, around, radius, out, owners, names}``; a wall is ``{corners, normal, offset, owners, names, place}``. ``owners`` are
+indices of agents in the team; ``names`` are the names of their constraints, in the same order.
 """
 
 from __future__ import annotations
@@ -17,21 +17,24 @@ from consat.views.figures import view
 from consat.views.shapes import Shapes, Walls, alike, boxes, shapes, ways
 
 MOST_SHAPES: Final = 20_000
-"""Constraints; of a larger team no regions are drawn."""
+"""Most constraints of a team whose regions are drawn. Of a team with more, none is."""
 FEW: Final = 12
-"""Up to so many agents have colours of their own, as in the pages' script."""
+"""Most agents that have colours of their own. The pages' script has the same number."""
 
 
 def frame(
     team: Team | None, x: np.ndarray, times: np.ndarray | None = None, stand: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The box to show, low and high, which holds the ways of moving balls, too.
+    """The box to show. It holds the paths (if they don't start far away), the regions with their motion, and the obstacles.
 
     Args:
-        team: whose regions are shown; None if nobody knows them.
+        team: team whose regions are shown; None if they are unknown.
         x: (T, N, d) paths, with d at most 3.
-        times: (T,) s, at which they were there; by default none has passed.
+        times: (T,) times of the positions, s; None for a single time, 0.
         stand: (B, 2, d) boxes around obstacles.
+
+    Returns:
+        low and high corner, (d,) each.
     """
     if team is None or len(team.owner) > MOST_SHAPES:
         low, high, _ = view(x, x[-1], None, stand)
@@ -48,7 +51,7 @@ def frame(
 
 
 def constraints_of(team: Team, found: Shapes) -> tuple[list[list[int]], list[list[int]]]:
-    """Of each ball, and of each half-space, the constraints that it stands for, by their numbers."""
+    """Indices of the constraints that each ball, and each half-space, stands for."""
     members: dict[int, list[int]] = {}
     first = alike(team)
     for number, same in enumerate(first.tolist()):
@@ -58,7 +61,7 @@ def constraints_of(team: Team, found: Shapes) -> tuple[list[list[int]], list[lis
 
 
 def balls_of(team: Team, found: Shapes, members: list[list[int]]) -> list[dict[str, Any]]:
-    """The balls of a team of at most three dimensions."""
+    """Balls as plain data, for a team of at most three dimensions; else empty. `members`: from `constraints_of`."""
     balls = found.balls
     return [
         {
@@ -75,10 +78,20 @@ def balls_of(team: Team, found: Shapes, members: list[list[int]]) -> list[dict[s
 
 
 def walls_of(team: Team, walls: Walls, members: list[list[int]], low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
-    """Half-spaces as polygons within the view, of a team in the plane as lines; those of a box are cut by each other."""
+    """Boundaries of half-spaces as plain data: polygons within the view, or lines for a team in the plane.
+
+    The sides of a box are cut by each other.
+
+    Args:
+        team: the team.
+        walls: its half-spaces.
+        members: for each half-space the constraints that it stands for, from `constraints_of`.
+        low: lower corner of the view.
+        high: upper corner of the view.
+    """
     if team.dimension not in (2, 3):
         return []
-    beyond = 10 * (high - low) * (team.dimension == 2)  # a reader may pan
+    beyond = 10 * (high - low) * (team.dimension == 2)  # lines go on outside of the view, because the reader can pan
     return [
         {
             "corners": np.round(corners, 6).tolist(),

@@ -1,4 +1,8 @@
-"""The formation at any recorded moment: paths, constraint regions, links and labels on one set of axes."""
+"""Drawing of the formation at any recorded moment: paths, constraint regions, links and labels on one set of axes.
+
+A small team has at most `MOST_AGENTS` agents and `MOST_CONSTRAINTS` constraints: each agent has its colour, marker and name. A larger team
+is drawn as a crowd: agents are dots coloured by margin.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +31,23 @@ from consat.views.shapes import Shapes, boxes, moves, shapes, ways
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
-"""Of a crowd: constraints of which regions are drawn at all, keep-outs that are hatched, walls, other ψ, regions that have edges."""
+"""Limits for crowds: constraints for any region to be drawn, hatched keep-outs, walls, other ψ, goal regions drawn with an edge."""
 GRID = 241
-"""Points along each side of the view at which ψ is evaluated."""
+"""Grid points per axis of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
 MOST_MAP = 2.0
-"""Obstacles that are this many times larger than what the agents travel are cut by the view."""
+"""The view may cut obstacles that are larger than this factor times the extent of the paths."""
 MOST_TIGHTEST, MOST_ASKED = 3, 20
-"""Of a crowd so many of the worst violated agents have their names written, where there is room."""
+"""Crowds: how many of the agents with the worst violation have a label, and among how many they are chosen so that labels don't overlap."""
 
 
 def _directions(points: np.ndarray, lengths: Sequence[int]) -> list[np.ndarray]:
-    """For each name the direction from its agent, at a point (N, 2) in pt, in which it meets the fewest others."""
+    """Unit vectors from agents to their labels, chosen so that labels overlap least.
+
+    Args:
+        points: (N, 2) positions of the agents, pt.
+        lengths: number of letters of each label.
+    """
     around = [np.array([np.cos(a), np.sin(a)]) for a in np.pi / 4 * np.array([1, 3, 7, 5, 2, 6, 0, 4])]
     taken, sizes, chosen = list(points), [np.array([6.0, 6.0])] * len(points), []
     for point, length in zip(points, lengths, strict=True):
@@ -53,31 +62,32 @@ def _directions(points: np.ndarray, lengths: Sequence[int]) -> list[np.ndarray]:
 
 
 class Scene:
-    """The formation of a result on axes; every `show` moves what is drawn, so a still is the last moment of a film.
+    """Artists for the formation of a result on one set of axes. Each `show` moves them to another moment.
 
-    In 1-D against time, beyond 3-D on the first two axes. A moment is a sample, or lies between two.
+    1-D positions are drawn against time; of more than three dimensions the first two axes are drawn. A moment is a sample index; a
+    fractional one is interpolated between two samples.
 
     Args:
-        result: of a run.
-        axes: what to draw on; if None, those of a new figure.
-        fine: points along each side of the view at which ψ is evaluated.
+        result: result of a run with recorded positions.
+        axes: matplotlib axes to draw on; None for those of a new figure.
+        fine: grid points per axis of the view at which ψ is evaluated.
 
     Attributes:
-        axes, figure: what it is drawn on.
-        moving: what `show` changes.
+        axes, figure: where the formation is drawn.
+        moving: the artists that `show` changes.
         x: (T, N, d) positions.
-        steps: (T,) times in s, or rounds.
-        last: the last sample at which every position is finite.
+        steps: (T,) times, s, or round numbers if rounds have no duration.
+        last: index of the last sample at which every position is finite.
     """
 
     def __init__(self, result: Result, axes: Any = None, fine: int = GRID) -> None:
-        data, team = recorded(result), None if "final_position" in result.data else result.team  # regions need everybody
+        data, team = recorded(result), None if "final_position" in result.data else result.team  # regions need the positions of all agents
         self.x, self._clock = data["position"].values, str(data["position"].dims[0])
         self.steps, self._margin, self._agent_margin = (data[name].values for name in (self._clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
         self.last = int(finite[-1]) if len(finite) else 0
         self._times = seconds(result, self.steps.astype(float))
-        if period(result) is not None:  # then people think in seconds
+        if period(result) is not None:  # rounds have a duration: show seconds
             self._clock, self.steps = "time", self._times
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
@@ -101,23 +111,23 @@ class Scene:
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
         rows, letters = self._legend() if self._few else self._crowd_legend(own)
         if own:
-            height = max(5.2, 0.6 + 0.235 * rows)  # at low resolutions letters are taller
+            height = max(5.2, 0.6 + 0.235 * rows)  # room for the legend; letters are taller at low resolutions
             self.figure.set_size_inches(1.5 + (height - 0.8) * ratio + 0.08 * letters, height + 0.6 * (not self._few))
         if self._space:
             list(self._in_space(self.x[self.last], self.last, moving=False))
         else:
             self._cast()
 
-    # ---- what stays
+    # ---- static parts
 
     def _trail(self, moment: float) -> np.ndarray:
-        """(K, N, 2 or 3) where the agents are drawn until a moment."""
+        """(K, N, 2 or 3) drawn coordinates of the agents from the start to a moment."""
         moments = np.append(np.arange(math.ceil(moment), dtype=float), moment)
         x = _between(self.x, moments)[:, :, : 3 if self._space else 2]
         return np.concatenate([np.broadcast_to(_between(self.steps, moments)[:, None, None], x.shape), x], axis=2) if self._line else x
 
     def _frame(self, names: Sequence[str], unit: str | None) -> float:
-        """Limits, labels and regions; returns how wide the axes should be for their height."""
+        """Set limits and labels, and draw the map and the static regions. Returns the aspect ratio of the axes, width by height."""
         axes, team, x = self.axes, self._team, self.x[self.last]
         axis_count = 3 if self._space else 2
         seen = self._then(self.last) if self._few else None
@@ -138,7 +148,7 @@ class Scene:
         axes.grid(color="0.92", linewidth=0.8)
         axes.set_axisbelow(True)
         if self._space:
-            axes.computed_zorder = False  # agents are seen through regions
+            axes.computed_zorder = False  # the given zorder holds, so that agents are visible through regions
         (bodies.map_in_space if self._space else bodies.map_in_plane)(axes, self._map)
         if team is not None:
             self._settle(team, x)
@@ -147,7 +157,7 @@ class Scene:
         return 1.25 if self._line or self._space else float((high - low)[0] / (high - low)[1])
 
     def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray | None:
-        """(B, 2, p) around the regions that the view has to hold besides what `view` finds."""
+        """(B, 2, p) boxes that the view must hold besides the regions that `view` finds; None if there are none."""
         if self._team is None:
             return self._near(axes)
         found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self._times[: self.last + 1])[:, :, :axes]]
@@ -159,7 +169,7 @@ class Scene:
         return np.concatenate(found)
 
     def _near(self, axes: int) -> np.ndarray:
-        """(B, 2, p) around the obstacles that are not much larger than what the agents travel."""
+        """(B, 2, p) boxes around the obstacles that are at most `MOST_MAP` times as large as the extent of the paths."""
         if not self._map:
             return np.zeros((0, 2, min(axes, self.x.shape[2])))
         around, paths = bodies.bounds(self._map, axes), self.x[: self.last + 1, :, :axes]
@@ -167,7 +177,7 @@ class Scene:
         return around[np.ptp(around, axis=1).max(axis=1) <= MOST_MAP * way]
 
     def _settle(self, team: Any, x: np.ndarray) -> None:
-        """The regions: those of a few agents follow at every `show`, those of a crowd that stay where they are stand here."""
+        """Prepare the regions. Small team: evaluate ψ and create the artists that `show` updates. Crowd: draw the fixed regions."""
         if self._line and self._few:
             times = _between(self._times, self._columns)
             columns = zip(times, _between(self.x, self._columns), strict=True)
@@ -188,22 +198,22 @@ class Scene:
             self._ground = Ground(self.axes, team, self._areas, self._unit)
 
     def _time(self, moment: float) -> float:
-        """The time, s, of a moment."""
+        """Time of a moment, s."""
         return float(_between(self._times, moment)[0])
 
     def _then(self, moment: float) -> Team | None:
-        """The team with its constraints as they are at a moment."""
+        """The team with its constraints at a moment; None if it has none to draw."""
         return None if self._team is None else self._team.at(self._time(moment))
 
     def _plain(self, found: Shapes, x: np.ndarray, moment: float) -> list[Artist]:
-        """The regions of a crowd in the plane, of constraints that don't move with agents; returns what was drawn."""
+        """Draw the regions of a crowd in the plane, except those that move with agents. Returns the new artists."""
         axes, team, before = self.axes, cast(Team, self._then(moment)), set(self.axes.get_children())
         center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
         goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
         self._kinds = {"goal": len(goals), "bar": len(bars)}
         look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
         if len(goals):
-            discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # all of one sense, so that overlaps are tinted once
+            discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
             union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
             axes.add_artist(union)
         if 0 < len(goals) <= MOST_TINTED:
@@ -229,7 +239,7 @@ class Scene:
         return [artist for artist in axes.get_children() if artist not in before]
 
     def _crowd_legend(self, own: bool) -> tuple[int, int]:
-        """A colour bar for the agents' margins, and below what the lines are; returns the legend's rows and the bar's letters."""
+        """Draw the colour bar of the agents' margins, and a legend below. Returns the rows and letters to make room for, as `_legend`."""
         palette, norm, edges, extend = classes(self._agent_margin[self.last])
         self._colours = ScalarMappable(norm, palette)
         place: dict[str, Any] = {"pad": 0.12, "shrink": 0.75} if self._space else {"pad": 0.03}
@@ -239,7 +249,7 @@ class Scene:
         line = functools.partial(Line2D, [], [])
         lines: list[Any] = [line(marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")]
         if self._robots is not None:
-            lines.clear()  # bodies are agents
+            lines.clear()  # agents are drawn as bodies, not as dots
         if self.x.shape[1] <= MOST_LINES:
             lines.append(line(color=TRAIL, linewidth=2, marker="o", markerfacecolor="white", markersize=4, label="start and path"))
         if len(self._links):
@@ -261,7 +271,7 @@ class Scene:
         return 0, 8
 
     def _legend(self) -> tuple[int, int]:
-        """Who is who, and whose region is which; returns its rows and letters."""
+        """Draw the legend of agents and regions. Returns its number of rows, and the letters of its longest entry."""
         line, team, ids = functools.partial(Line2D, [], []), self._team, self._ids
         lines: list[Any] = [line(color=colour(i), marker=marker(i), label=name) for i, name in enumerate(ids)]
         lines.append(line(color=GREY, marker="o", markerfacecolor="white", linestyle="", label="start"))
@@ -278,7 +288,7 @@ class Scene:
         return len(lines) + 1, max(len(str(entry.get_label())) for entry in lines)
 
     def _region_lines(self) -> Iterator[Any]:
-        """The legend's entries for regions: each by name, or of very many what the strokes mean."""
+        """Legend entries for regions: one per name; for many regions, the meaning of the line styles only."""
         line = functools.partial(Line2D, [], [])
         told = {f"{self._owners(area)}: {plain(area.name)}": area for area in reversed(self._areas)}
         if len(told) > MOST_ENTRIES:
@@ -301,10 +311,10 @@ class Scene:
         names = [self._ids[owner] for owner in area.owners]
         return ", ".join(names) if len(names) <= 3 else f"{len(names)} agents"
 
-    # ---- what moves
+    # ---- moving parts
 
     def _cast(self) -> None:
-        """Make the artists in the plane; `show` moves them."""
+        """Create the artists in the plane; `show` moves them."""
         trail, axes = self._trail(0.0), self.axes
         ground = [] if self._ground is None else self._ground.artists
         look: dict[str, Any] = {"linewidth": 1.0, "linestyle": DOTS} if self._few else {"linewidth": 0.7}
@@ -360,7 +370,7 @@ class Scene:
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 
     def _move(self, trail: np.ndarray, moment: float) -> None:
-        """Move the artists in the plane."""
+        """Move the artists in the plane to a moment; `trail` from `_trail`."""
         if not self._line:
             self._wires.set_data(*_joined(trail[-1][self._links]))
         if self._ground is not None:
@@ -423,7 +433,7 @@ class Scene:
         return self._colours.to_rgba(np.ma.masked_invalid(margins))
 
     def _in_space(self, x: np.ndarray, moment: float, *, moving: bool) -> Iterator[Artist]:
-        """Regions in space with the team at x (N, d): those that move, or those that stay."""
+        """Draw regions in space with the team at x (N, d): only those that move, or only those that don't."""
         team = self._then(moment)
         if self._team is None or team is None or self._shapes is None:
             return
@@ -437,7 +447,7 @@ class Scene:
             yield from space.sections(self.axes, team, others, x, self._low, self._high)
 
     def _agents(self, trail: np.ndarray) -> Iterator[Artist]:
-        """A few agents in space."""
+        """Draw a small team in space."""
         for i, name in enumerate(self._ids):
             yield from self.axes.plot(*trail[:, i].T, **_path(i))
             yield from self.axes.plot(*trail[0, i, :, None], **_start(i))
@@ -445,11 +455,11 @@ class Scene:
             yield self.axes.text(*trail[-1, i], f"  {name}", **_ink(i))
 
     def _head(self, agent: int) -> dict[str, Any]:
-        """The look of a few agents' recorded positions; within a body it is a dot."""
+        """Marker style of an agent's position; a small dot if its body is drawn around it."""
         return _head(agent) | ({} if self._robots is None else {"markersize": 3.5, "marker": "o", "markeredgewidth": 0.6})
 
     def _crowd(self, trail: np.ndarray, sample: int) -> Iterator[Artist]:
-        """Many agents in space, coloured by margin."""
+        """Draw a crowd in space, coloured by margin."""
         count = trail.shape[1]
         if count <= MOST_LINES:
             yield from self.axes.plot(*_joined(_thin(trail)), color=TRAIL, linewidth=0.8, zorder=1, gid="path")
@@ -471,17 +481,17 @@ def _head(agent: int) -> dict[str, Any]:
 
 
 def _dots(count: int) -> dict[str, Any]:
-    """The look of a crowd of so many."""
+    """Marker style of a crowd of `count` agents."""
     return {"s": 40 if count < 60 else 22 if count < 200 else 9, "edgecolors": "0.2", "linewidths": 0.5, "zorder": 5, "gid": "head"}
 
 
 def _ink(agent: int) -> dict[str, Any]:
-    """How the name of an agent is written."""
+    """Text style of an agent's name."""
     return {"color": colour(agent), "weight": "bold", "path_effects": [withStroke(linewidth=2.5, foreground="w")]}
 
 
 def _thin(trail: np.ndarray) -> np.ndarray:
-    """(N, K, p) the paths of a crowd (T, N, p), with fewer points where they are very many; of more than `MOST_LINES` agents, none."""
+    """Paths (T, N, p) → (N, K, p), with fewer samples if there are very many; no samples for more than `MOST_LINES` agents."""
     steps, count = trail.shape[:2]
     if count > MOST_LINES:
         return trail[:0].swapaxes(0, 1)
@@ -489,19 +499,19 @@ def _thin(trail: np.ndarray) -> np.ndarray:
 
 
 def _between(series: np.ndarray, moment: Any) -> np.ndarray:
-    """(K, …) the values of a series (T, …) at K moments."""
+    """(K, …) values of a series (T, …) at K moments, interpolated linearly."""
     moment = np.atleast_1d(moment)
     share = (moment % 1).reshape(-1, *(1,) * (series.ndim - 1))
     return (1 - share) * series[moment.astype(int)] + share * series[np.ceil(moment).astype(int)]
 
 
 def _joined(segments: np.ndarray) -> np.ndarray:
-    """(S, K, p) lines → (p, S·(K + 1)) one line, broken by NaN: one artist is much quicker than many."""
+    """Lines (S, K, p) → one line (p, S·(K + 1)), separated by NaN, because one artist is much faster than many."""
     return np.concatenate([segments, np.full_like(segments[:, :1], np.nan)], axis=1).reshape(-1, segments.shape[2]).T
 
 
 def moments(scene: Scene, count: int, movement: float) -> np.ndarray:
-    """(count,) moments from start to end: by a share of `movement` evenly along the way travelled, for the rest by the clock."""
+    """(count,) moments from start to end, spaced by a mean of distance travelled (weight `movement`, 0 to 1) and clock."""
     x, clock = scene.x[: scene.last + 1], scene.steps[: scene.last + 1] - float(scene.steps[0])
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
     share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)

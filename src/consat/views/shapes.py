@@ -1,7 +1,7 @@
-"""The regions of library constraints as geometry: balls and half-spaces, each once however many agents share it.
+"""Geometry of library constraints: balls and half-spaces. A region that several agents share is listed once.
 
-What other ψ look like is found by evaluating them, see `consat.views.figures.regions`; here stands what can be read off the parameters,
-for views of many agents, in space, and outside matplotlib.
+The geometry is computed from the parameters, for views of crowds, in space, and outside matplotlib. All other ψ must be evaluated: see
+`consat.views.figures.regions`.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from consat.problem.family import Family
 from consat.problem.team import Team
 
 BALLS: Final[Mapping[str, bool]] = {"within": False, "outside": True, "near": False, "apart": True, "displacement": False}
-"""The kinds whose boundary is a ball, and whether it keeps its owner out."""
+"""Kinds whose boundary is a ball. The value says whether the owner must stay outside."""
 WALLS: Final = ("halfspace", "box")
 WAYS: Final = 20
-"""Times at which moving balls are asked for, to find the view that holds their way."""
+"""Number of times at which moving balls are sampled for a view that holds their motion, about."""
 
 
 @dataclass(frozen=True, eq=False)
 class Balls:
-    """K balls; equal ones of several owners are one.
+    """K balls. Equal balls of several owners are merged to one.
 
     Attributes:
-        center: (K, d) where they are, relative to agent `around` where there is one.
-        around: (K,) the place in the team of the agent that they move with, or -1.
-        radius: (K,).
+        center: (K, d) centre; relative to the agent `around` if there is one.
+        around: (K,) index of the agent that the ball moves with, or -1.
+        radius: (K,) radius.
         keeps_out: (K,) whether the owners must stay outside.
-        moves: (K,) whether they move, with an agent or by a schedule.
-        owners: of each the places of its owners, ascending.
-        number: (K,) the first of the constraints that each stands for.
+        moves: (K,) whether the ball moves, with an agent or by a schedule.
+        owners: for each ball the indices of its owners, ascending.
+        number: (K,) index of the constraint; of several, the first.
     """
 
     center: np.ndarray
@@ -45,19 +45,19 @@ class Balls:
     number: np.ndarray
 
     def at(self, x: np.ndarray) -> np.ndarray:
-        """(K, d) the centers, with the team at x (N, d)."""
+        """(K, d) absolute centres, with the team at x (N, d)."""
         return self.center + np.where(self.around[:, None] >= 0, x[self.around], 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """K half-spaces normal·x ≤ offset, as `Balls`.
+    """K half-spaces normal·x ≤ offset. Equal half-spaces of several owners are merged to one.
 
     Attributes:
-        normal: (K, d), of length 1, to the forbidden side.
-        offset: (K,).
-        owners: of each the places of its owners, ascending.
-        number: (K,) the first of the constraints that each stands for.
+        normal: (K, d) unit vector towards the forbidden side.
+        offset: (K,) distance of the boundary from the origin, along `normal`.
+        owners: for each half-space the indices of its owners, ascending.
+        number: (K,) index of the constraint; of several, the first.
     """
 
     normal: np.ndarray
@@ -68,12 +68,12 @@ class Walls:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """The geometry of a team's constraints.
+    """Geometry of a team's constraints.
 
     Attributes:
-        balls: those of the kinds of `BALLS`.
-        walls: those of the kinds of `WALLS`.
-        others: (M',) constraints whose geometry cannot be read off, each different one once.
+        balls: constraints of the kinds in `BALLS`.
+        walls: constraints of the kinds in `WALLS`.
+        others: (M',) indices of constraints without closed-form geometry; of equal ones, the first.
     """
 
     balls: Balls
@@ -82,7 +82,7 @@ class Shapes:
 
 
 def shapes(team: Team, time: float = 0.0) -> Shapes:
-    """The geometry of the constraints of a team at a time, s; the same balls and walls in the same order at every time."""
+    """The geometry of a team's constraints at a time, s. Number and order of balls and walls are the same at all times."""
     ties = moves(team)
     balls: dict[Hashable, list[Any]] = {}
     walls: dict[Hashable, list[Any]] = {}
@@ -123,7 +123,7 @@ def shapes(team: Team, time: float = 0.0) -> Shapes:
 
 
 def alike(team: Team) -> np.ndarray:
-    """(M,) for each constraint the first one that has the same region, wherever everybody is; itself, if it is the first."""
+    """(M,) for each constraint the index of the first one that has the same region at all positions and times; it may be itself."""
     first: dict[Hashable, int] = {}
     found = np.arange(len(team.owner))
     for key, family, k in sorted(_distinct(team), key=lambda each: int(each[1].number[each[2]])):
@@ -142,7 +142,7 @@ def moves(team: Team) -> np.ndarray:
 
 
 def boxes(team: Team) -> np.ndarray:
-    """(B, 2, d) the different boxes that agents must be in, low and high."""
+    """(B, 2, d) the distinct ``box`` constraints of the team, low and high corner."""
     lows, highs = (
         {
             int(owner): corner
@@ -157,7 +157,7 @@ def boxes(team: Team) -> np.ndarray:
 
 
 def ways(team: Team, times: np.ndarray) -> np.ndarray:
-    """(B, 2, d) boxes around the balls that move by schedules, at some times, s, of a run."""
+    """(B, 2, d) boxes around the balls that move by a schedule, at about `WAYS` of the given times, s."""
     found = [np.zeros((0, 2, team.dimension))]
     if team.moves:
         for time in times[:: max(1, len(times) // WAYS)].tolist():
@@ -169,8 +169,10 @@ def ways(team: Team, times: np.ndarray) -> np.ndarray:
 
 
 def _distinct(team: Team, time: float = 0.0) -> Iterator[tuple[Hashable, Family, int]]:
-    """Every constraint, as it is at a time, with a key that those with the same region share: function, parameters at all times, and whom
-    it reads besides its owner."""
+    """Yield (key, family, row) for every constraint at a time. Constraints with the same region have the same key.
+
+    The key holds the function, the parameters at all times, and the agents that ψ reads besides its owner.
+    """
     instants = team.instants
     for place, family in enumerate(team.at(time).families):
         told = [sorted(instant.families[place].parameters.items()) for instant in instants]
@@ -181,7 +183,7 @@ def _distinct(team: Team, time: float = 0.0) -> Iterator[tuple[Hashable, Family,
 
 
 def _wall(given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float] | None:
-    """Normal and offset of a `consat.halfspace`, or of one side of a `consat.box`."""
+    """Unit normal and offset of a `consat.halfspace`, or of one side of a `consat.box`; None if the parameters fit neither."""
     if "normal" in given:
         length = float(np.linalg.norm(given["normal"]))
         return np.asarray(given["normal"]) / length, float(given["offset"]) / length

@@ -1,4 +1,4 @@
-"""Regions and depth in three dimensions: balls, walls cut to size, cross-sections of any other ψ, and a floor with the agents' shadows."""
+"""Drawing in three dimensions: balls, half-spaces cut by the view, cross-sections of other ψ, and shadows of the agents on a floor."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from consat.views.figures import colour, grid, regions
 from consat.views.shapes import Balls, Shapes, Walls
 
 MOST_BALLS: Final = 60
-"""Of more balls only those that keep agents out, and of those not more than this, are drawn."""
+"""Most balls that are drawn. If there are more, only keep-outs are drawn, and at most this many."""
 MOST_FINE: Final = 12
-"""Of more balls each has fewer faces."""
+"""Most balls that are drawn finely. If there are more, each has fewer faces."""
 SECTION: Final = 61
 FLOOR: Final = "0.55"
 
 
 def _sphere(around: int, down: int) -> np.ndarray:
-    """(3, around, down) points on the unit sphere."""
+    """(3, around, down) grid of points on the unit sphere."""
     longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, around), np.linspace(0, np.pi, down), indexing="ij")
     return np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
 
@@ -35,14 +35,14 @@ def _shade(owners: Sequence[int]) -> str:
 
 
 def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: Any = None) -> Iterator[Artist]:
-    """Balls with the team at x (N, d): goals as glass with three great circles, keep-outs as solid bodies.
+    """Draw balls: goals almost transparent, keep-outs solid, both with three great circles.
 
     Args:
-        axes: to draw on.
+        axes: 3-D axes to draw on.
         found: the balls.
-        x: (N, d).
-        chosen: which of them.
-        goal: the colour of goals; if None, those of their owners.
+        x: (N, d) positions of the team.
+        chosen: indices of the balls to draw.
+        goal: colour of goals; None for the colours of their owners.
     """
     many = len(chosen) > MOST_FINE
     angle = np.linspace(0, 2 * np.pi, 25 if many else 49)
@@ -68,7 +68,7 @@ def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: A
 
 
 def walls(axes: Any, found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[Artist]:
-    """Half-spaces within the view, each cut by the others of the same owners, so that the sides of a box make a box."""
+    """Draw the boundaries of half-spaces within the view. Those of the same owners cut each other, so that sides form a box."""
     for k, corners in faces(found, low, high):
         shade = _shade(found.owners[k])
         look: dict[str, Any] = {"facecolors": [to_rgba(shade, 0.08)], "edgecolors": [to_rgba(shade, 0.8)], "linewidths": 1.0}
@@ -77,7 +77,10 @@ def walls(axes: Any, found: Walls, low: np.ndarray, high: np.ndarray) -> Iterato
 
 
 def faces(found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Number and corners, (C, d), of each half-space's boundary within a box, cut by the others of the same owners; a line in the plane."""
+    """Yield the index of each half-space and the corners, (C, d), of its boundary within a box, cut by the others of the same owners.
+
+    In the plane the boundary is a line with two corners.
+    """
     for k, (normal, offset) in enumerate(zip(found.normal, found.offset, strict=True)):
         corners = _face(normal, offset, low, high)
         for j, owners in enumerate(found.owners):
@@ -88,7 +91,7 @@ def faces(found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int
 
 
 def _face(normal: np.ndarray, offset: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(C, d) corners of a plane normal·x = offset within a box: a square around the middle of the view, cut by the sides of the box."""
+    """(C, d) corners of the plane normal·x = offset within a box: a large square, cut by the sides of the box."""
     middle, sides = (low + high) / 2, np.eye(len(low))
     foot, size = middle + (offset - middle @ normal) * normal, 2 * float(np.linalg.norm(high - low))
     if len(low) == 2:
@@ -107,7 +110,7 @@ def _face(normal: np.ndarray, offset: float, low: np.ndarray, high: np.ndarray) 
 
 
 def _cut(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    """What of a convex polygon (C, d) has normal·x ≤ offset (Sutherland and Hodgman, 1974)."""
+    """The part of a convex polygon (C, d) with normal·x ≤ offset (Sutherland and Hodgman, 1974)."""
     kept: list[np.ndarray] = []
     beyond = corners @ normal - offset if len(corners) else np.zeros(0)
     for k, (here, there) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -120,7 +123,7 @@ def _cut(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
 
 
 def sections(axes: Any, team: Team, numbers: Sequence[int], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[Artist]:
-    """The boundaries of any ψ on the three planes through its owner."""
+    """Draw the boundary of ψ on the three coordinate planes through its owner, for the constraints `numbers`; x: (N, 3)."""
     along = np.linspace(low, high, SECTION, axis=-1)
     for owner in sorted({int(team.owner[k]) for k in numbers}):
         mine = [k for k in numbers if team.owner[k] == owner]
@@ -143,7 +146,7 @@ def sections(axes: Any, team: Team, numbers: Sequence[int], x: np.ndarray, low: 
 
 
 def chosen(found: Shapes) -> list[int]:
-    """Which balls are drawn."""
+    """Indices of the balls to draw; see `MOST_BALLS`."""
     everything = list(range(len(found.balls.radius)))
     if len(everything) <= MOST_BALLS:
         return everything
@@ -151,7 +154,14 @@ def chosen(found: Shapes) -> list[int]:
 
 
 def shadows(axes: Any, trail: np.ndarray, floor: float, *, paths: bool) -> Iterator[Artist]:
-    """On the floor a dot below every agent and a stem up to it; below few agents also their paths. They tell depth."""
+    """Draw depth cues: on the floor, a dot below each agent, and a vertical stem up to it.
+
+    Args:
+        axes: 3-D axes to draw on.
+        trail: (T, N, 3) positions over time; the last are the agents.
+        floor: height of the floor.
+        paths: whether to draw the paths on the floor, too.
+    """
     feet = np.concatenate([trail[-1, :, :2], np.full((trail.shape[1], 1), floor)], axis=1)
     yield axes.scatter(*feet.T, s=10, color=FLOOR, marker=".", depthshade=False, zorder=0.3, gid="shadow")
     stems = Line3DCollection(np.stack([feet, trail[-1]], axis=1), colors=FLOOR, linewidths=0.6, linestyles=":", zorder=0.3, gid="shadow")

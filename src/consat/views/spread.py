@@ -1,4 +1,4 @@
-"""The figure of a sweep: how soon, how well and how often, over the values of a parameter, with the spread over the seeds."""
+"""Figure of a sweep: time to satisfaction, last margin and success rate over a parameter, with the spread over the seeds."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from consat.views.figures import COLOURS, DPI, GREY, MARKERS, STYLES, plain
 
 MOST_LINES, MOST_BANDS = 6, 3
-"""Of a second parameter so many values get a line of their own; of more lines the spread is a bar at each value, not a band."""
+"""Most values of the other parameters that have a line, and most lines whose spread is a band; with more lines it is bars."""
 LOGARITHMIC = 30.0
-"""A parameter that spans more than this factor, in even ratios, is drawn on a logarithmic axis."""
+"""The axis of a parameter is logarithmic if its values span more than this factor, in nearly constant ratios."""
 
 
 def save(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Draw a sweep.
 
     Args:
-        summary: of the sweep (schema consat.sweep/1).
-        runs: its rows.
-        path: of the PNG file.
+        summary: summary of the sweep (schema consat.sweep/1).
+        runs: rows of the sweep, one per run.
+        path: PNG file to write.
+
+    Returns:
+        the path of the file.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -35,7 +38,7 @@ def save(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], path: st
 
 
 def draw(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Figure:
-    """The figure that `save` writes."""
+    """The figure that `save` writes; arguments as there."""
     figure = Figure(figsize=(8.4, 8.2), layout="constrained")
     if summary["over"]:
         _over(figure, summary)
@@ -55,7 +58,7 @@ def _unit(summary: Mapping[str, Any]) -> str:
 
 
 def _over(figure: Figure, summary: Mapping[str, Any]) -> None:
-    """Three panels above one another over the parameter with the most values, a line for each value of the others."""
+    """Draw three panels over the parameter with the most values, with a line for each combination of values of the others."""
     over: Mapping[str, Sequence[Any]] = summary["over"]
     along = max(over, key=lambda path: len(over[path]))
     others = [path for path in over if path != along]
@@ -114,7 +117,7 @@ def _dress(axes: Sequence[Axes], summary: Mapping[str, Any]) -> None:
 
 
 def _places(values: Sequence[Any]) -> tuple[np.ndarray, list[str], bool]:
-    """Where the values of a parameter stand on its axis, what they are called, and whether they are numbers."""
+    """Positions of a parameter's values on the axis, their labels, and whether they are numbers."""
     numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     places = np.array(values, dtype=float) if numeric else np.arange(len(values), dtype=float)
     return places, [plain(str(value), 16) for value in values], numeric
@@ -127,7 +130,7 @@ def _even_ratios(places: np.ndarray) -> bool:
 
 
 def _seeds(figure: Figure, summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> None:
-    """How often each outcome came up among the seeds."""
+    """Draw histograms over the seeds, for a sweep without parameters."""
     figure.set_size_inches(8.4, 6.2)
     panels = figure.subplots(2, 1)
     [group] = summary["groups"]

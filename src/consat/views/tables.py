@@ -1,4 +1,4 @@
-"""What `consat check`, `consat solve` and `consat sweep` show on a terminal."""
+"""Terminal output of `consat check`, `consat solve` and `consat sweep`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from consat.errors import counted
 from consat.views.words import ROUTE, VERDICT
 
 MOST_ROWS = 30
-"""Of longer lists only the beginning is shown."""
+"""Most rows of a table. Of longer lists the beginning is shown."""
 CURVATURE = {
     "strictly-concave": "strictly concave",
     "concave": "concave",
@@ -24,7 +24,7 @@ ANSWER = {True: "[green]yes[/]", False: "[red]no[/]", None: "[yellow]open[/]"}
 
 
 def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """The findings of `consat.certify.assumptions.report`, for people."""
+    """Render the findings of `consat.certify.assumptions.report`; `name`: of the scenario."""
     clusters = findings["clusters"]
     shape = [
         counted(findings[key], noun) for key, noun in (("count", "agent"), ("constraint_count", "constraint"), ("cluster_count", "cluster"))
@@ -52,7 +52,7 @@ def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 
 def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """The answer of `consat.solve`, for people."""
+    """Render the answer of `consat.solve`."""
     yield f"[bold]{escape(answer['scenario'])}[/]: {VERDICT[answer['verdict']]}"
     yield f"  {_best(answer)}"
     yield f"  {escape(answer['method'])}"
@@ -73,7 +73,7 @@ def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 
 def _best(answer: Mapping[str, Any]) -> str:
-    """The margin that was found, and what is proven of it."""
+    """The best margin found, and what is proven about it."""
     upper = answer["bounds"][1]
     if answer["margin"] is None:
         return "best margin unbounded"
@@ -85,7 +85,7 @@ def _best(answer: Mapping[str, Any]) -> str:
 
 
 def sweep(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """The outcome of `consat.sweep`, for people: a row for each combination of values."""
+    """Render the summary of `consat.sweep`: one row for each combination of values."""
     groups = summary["groups"]
     each = f", {counted(groups[0]['runs'], 'seed')} each" if len(groups) > 1 else ""
     runs = f"{counted(summary['count'], 'run')} of {summary['protocol']}{each}, in {summary['seconds']:.1f} s"

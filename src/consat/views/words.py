@@ -1,4 +1,4 @@
-"""A run in words: what ``print(result)`` shows."""
+"""Text of a run's summary, as ``print(result)`` shows it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 from consat.errors import counted
 
 MOST_AGENTS = 10
-"""Of how many agents every position is listed; of more, only those with the smallest margins are named."""
+"""Most agents whose positions are listed. Of a larger team, only the agents with the smallest margins are named."""
 MOST_BINDING, MOST_VIOLATED, MOST_AXES, MOST_LETTERS = 5, 3, 6, 24
 MOST_INTERVALS, MOST_STUCK = 6, 10
 SLIGHT = 0.01
-"""Constraints with a smaller multiplier don't bind."""
+"""Smallest multiplier of a constraint that is listed as binding; and smallest share of a run for which an undecided interval is listed."""
 
 STATUS = {
     "satisfied": "every constraint holds",
@@ -32,9 +32,9 @@ KNOWN = {
     "infeasible": "each that the constraints cannot all hold, by a proof of the team's own",
 }
 ROUTE = {"tree": "a tree", "links": "the links"}
-"""Along what copies travel."""
+"""Routes of the copies: along which links they are sent."""
 BEST = "max-min"
-"""The protocol that ends at the best margin."""
+"""The protocol that converges to the best margin."""
 VERDICT = {
     "feasible": "feasible: the constraints can all hold",
     "infeasible": "infeasible: proven, the constraints cannot all hold",
@@ -43,7 +43,12 @@ VERDICT = {
 
 
 def summary(summary: Mapping[str, Any], reasons: Sequence[str] = ()) -> str:
-    """A summary, as ``consat run --json`` prints it, as text for people; `reasons` say what stands in the way."""
+    """Text of a summary of a run.
+
+    Args:
+        summary: as ``consat run --json`` prints it.
+        reasons: sentences that say which constraints conflict.
+    """
     status, ending = STATUS[summary["status"]], ENDING.get(summary.get("ending", ""))
     lines = [f"{summary['scenario']}: {status}" + (f"; {ending}" if ending and summary["status"] != "diverged" else "")]
     for name, value in (
@@ -59,7 +64,7 @@ def summary(summary: Mapping[str, Any], reasons: Sequence[str] = ()) -> str:
 
 
 def sweep(summary: Mapping[str, Any]) -> str:
-    """A sweep in a few lines, a line for each combination of values."""
+    """Text of a sweep's summary: one line for each combination of values."""
     lines = [f"{summary['scenario']}: {counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"]
     for group in summary["groups"]:
         named = ", ".join(f"{path} = {value}" for path, value in group["values"].items()) or "all"
@@ -105,7 +110,7 @@ def _when(summary: Mapping[str, Any]) -> str:
 
 
 def motion(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """What is said of teams that move, and of robots."""
+    """Yield the lines, name and text, about moving constraints and about robots."""
     if summary.get("verdicts"):
         yield "over time", over_time(summary)
         yield "kept up", kept_up(summary)
@@ -114,7 +119,7 @@ def motion(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def over_time(summary: Mapping[str, Any]) -> str:
-    """When the constraints of a team that moves can all hold; what is undecided only where it is long."""
+    """Text of the intervals in which moving constraints can, or cannot, all hold. Short undecided intervals are left out."""
     verdicts = summary["verdicts"]
     duration = verdicts[-1]["to"]
     told = [each for each in verdicts if each["verdict"] != "undecided" or each["to"] - each["from"] >= SLIGHT * duration]
@@ -124,20 +129,20 @@ def over_time(summary: Mapping[str, Any]) -> str:
 
 
 def kept_up(summary: Mapping[str, Any]) -> str:
-    """For how much of the time every constraint of a team that moves held."""
+    """Text of the share of time in which all moving constraints held."""
     motion = summary["motion"]
     share = motion["satisfied_share_after"]
     if share is None:
         return "never: at no time did every constraint hold"
     duration, rounds = motion["duration"], summary["rounds"]
-    later = motion["satisfied_share"] / share  # both count the same rounds
+    later = motion["satisfied_share"] / share  # both count the same satisfied rounds: the ratio is the share of later rounds
     before = (1 - later) * (rounds + 1) / max(rounds, 1) * duration
     told = "at all times" if share == 1 else f"for {math.floor(1000 * share) / 10:g} % of the time"
     return f"every constraint held {told} after t = {_number(before)} s; worst margin {_number(motion['worst_margin_after'])}"
 
 
 def bodies(summary: Mapping[str, Any]) -> str:
-    """How near robots came to each other and to obstacles, and who did not get on."""
+    """Text of contacts, smallest distances between robots and to obstacles, and robots that were stuck."""
     motion = summary["motion"]
     gap, clear, contacts = (motion[key] for key in ("smallest_distance", "clearance", "contacts"))
     told = ["nobody touched" if not contacts else counted(contacts, "pair", "pairs") + " touched"]
@@ -150,7 +155,7 @@ def bodies(summary: Mapping[str, Any]) -> str:
 
 
 def _way(summary: Mapping[str, Any], way: Mapping[str, Any]) -> str:
-    """The constraints that were violated for the largest share of a run, whatever its end."""
+    """Text of the constraints that were violated for the largest share of a run, whether or not they hold at the end."""
     worst = way["worst"]
     told = [(worst["violated_share"], worst["agent"], worst["constraint"])]
     if summary.get("agents") is not None:
@@ -174,7 +179,7 @@ def _share(share: float) -> str:
 
 
 def _advice(summary: Mapping[str, Any]) -> str | None:
-    """What gets a team farther that did not converge, and was not interrupted."""
+    """Advice for a run that did not converge and was not interrupted; else None."""
     if summary["status"] != "not-converged" or summary.get("ending") == "interrupted":
         return None
     settled = summary.get("ending") == "settled"
@@ -200,7 +205,7 @@ def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _who(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Which constraints bind, and where the agents are."""
+    """Yield the lines about binding constraints and positions of the agents."""
     agents, positions = summary.get("agents"), summary.get("positions")
     if agents is None or positions is None:
         yield "agents", f"{summary['count']:,}, too many to list"
@@ -230,7 +235,7 @@ def _who(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _places(positions: Sequence[Sequence[float | None]]) -> list[str]:
-    """Positions in columns, with the digits that the size of the formation deserves."""
+    """Positions as aligned columns. The number of decimals depends on the largest coordinate."""
     largest = max((abs(x) for position in positions for x in position if x is not None), default=0.0)
     if largest and not 1e-3 <= largest < 1e6:
         texts = [[_number(x) for x in position] for position in positions]
