@@ -136,6 +136,7 @@ class Session:
         state, chunk = self._engine.carrier.start()
         self._state: Now = state
         self._tally, self._record = Tally(), Memory()
+        self._own_margins: np.ndarray | None = None
         self._take(chunk)
 
     # ---- stepping -----------------------------------------------------------------------------------------------------------------------
@@ -166,7 +167,7 @@ class Session:
         count = len(numbers)
         kept = [leaf[:count] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound, chunk.kept.position, chunk.kept.agent_margin)]
         margin, smooth, bound, position, margins = kept
-        self._margins, self._positions = margins[-1], position[-1]
+        self._own_margins, self._positions = margins[-1], position[-1]
         chosen = numbers % self._record.every == 0
         if chosen.any():
             heading = None if self._body.drive is None else chunk.kept.heading[:count]
@@ -201,7 +202,7 @@ class Session:
     @property
     def margins(self) -> np.ndarray:
         """(N,) the margin of every agent, in the order of ``session.team.ids``."""
-        return np.array(self._margins)
+        return np.array(self._margins())
 
     @property
     @float64
@@ -213,7 +214,7 @@ class Session:
     @property
     def margin(self) -> float:
         """The smallest of `margins`: positive if every constraint of every agent holds."""
-        return float(self._margins.min(initial=np.inf))
+        return float(self._margins().min(initial=np.inf))
 
     @property
     def satisfied(self) -> bool:
@@ -254,6 +255,7 @@ class Session:
                 live[change.family][key][change.member] = value
             self._reach_out(change)
         self._note_changes({int(team.owner[change.number]) for change in changes})
+        self._own_margins = None
         return self
 
     @float64
@@ -274,7 +276,7 @@ class Session:
             raise InvalidTeam(faults)
         self._state = _placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
         self._positions = np.asarray(self._state.body)
-        self._margins = np.asarray(_margins(self._engine.carrier.world, self._state, float(self.round)))
+        self._own_margins = None
         return self
 
     @float64
@@ -447,7 +449,7 @@ class Session:
         if not len(rows.step) or rows.step[-1] != tally.done:
             margin, smooth, bound = (np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound))
             heading = None if (now := self.headings) is None else now[None]
-            done, own = np.array([tally.done]), self._margins[None]
+            done, own = np.array([tally.done]), self._margins()[None]
             last = Rows(done, self._positions[None], None, margin, smooth, own, None, None, bound, heading)
             rows = rows.joined(last) if len(rows.step) else last
         period, team = 1.0 / self._body.rate, self.team
@@ -468,6 +470,13 @@ class Session:
         return f"<Session of {self._name}: {team.count} agents, round {self.round}, margin {self.margin:.4g}>"
 
     # ---- inside -------------------------------------------------------------------------------------------------------------------------
+
+    @float64
+    def _margins(self) -> np.ndarray:
+        """(N,) margins of the agents where they are, of the constraints as they are; computed anew after a change."""
+        if self._own_margins is None:
+            self._own_margins = np.asarray(_agent_margins(self._engine.carrier.world, self._state, float(self.round)))
+        return self._own_margins
 
     def _body_of(self, team: Team) -> Body:
         """Motion of the bodies of a team."""
@@ -506,11 +515,11 @@ class Session:
         if robots is not None and self._state.robots is not None and body.drive is not None:
             robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
         state = state._replace(state=_begun_anew(inner), body=on_device(place), key=self._state.key, robots=robots)
-        margins = np.asarray(_margins(engine.carrier.world, state, float(self.round)))
+        margins = np.asarray(_agent_margins(engine.carrier.world, state, float(self.round)))
         # the session is modified only below, where no error can be raised
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
-        self._engine, self._state, self._positions, self._margins, self._body = engine, state, place, margins, body
+        self._engine, self._state, self._positions, self._own_margins, self._body = engine, state, place, margins, body
         self._extent = max(self._extent, ready.size.extent / ready.size.length)
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
@@ -629,7 +638,7 @@ def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> 
 
 
 @jax.jit
-def _margins(world: World, now: Now, round_: Any) -> Any:
+def _agent_margins(world: World, now: Now, round_: Any) -> Any:
     observer: Objective = world.at(on_device(round_)).observer
     return observer.agent_margins(now.body)
 
