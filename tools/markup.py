@@ -67,7 +67,7 @@ class Site(Extension):
     def extendMarkdown(self, md: Markdown) -> None:  # noqa: N802
         md.preprocessors.register(_Files(md), "files", 100)  # before fences are taken out
         md.inlinePatterns.register(_Inline(r"(?<![\\$\w])\$([^$\s](?:[^$\n]*[^$\s])?)\$(?![\w$])", md), "mathematics", 185)  # after code
-        md.treeprocessors.register(_Links(md), "links", 100)
+        md.treeprocessors.register(_Links(md), "links", 19)  # right after links are there
 
 
 def makeExtension(**options: Any) -> Site:  # noqa: N802
