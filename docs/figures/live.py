@@ -1,6 +1,6 @@
 """Film the live page for the documents: python docs/figures/live.py [CHROMIUM].
 
-It drags a goal of case B, within what the team can do and beyond, and back; needs consat[live], playwright and Pillow, which the extra test has.
+It drags a goal of case B, within what the team can do and beyond, and back. The extra test has what it needs.
 """
 
 import io
