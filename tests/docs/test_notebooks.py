@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-nbclient = pytest.importorskip("nbclient", reason="needs the extra notebook: pip install '.[notebook]'")
-pytest.importorskip("ipykernel", reason="needs the extra notebook: pip install '.[notebook]'")
+nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel, which the extra test installs")
+pytest.importorskip("ipykernel", reason="needs nbclient and ipykernel, which the extra test installs")
 import nbformat  # noqa: E402 - comes with nbclient
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "docs" / "notebooks").glob("*.ipynb"))
