@@ -20,7 +20,13 @@ SCRIPTS = Path(sysconfig.get_path("scripts"))
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 
 
-SMALLER = {"count=1000000": "count=1000", "count: 10000": "count: 400", "10_000": "1_000", "seeds=100": "seeds=20"}
+SMALLER = {
+    "count=1000000": "count=1000",
+    "count: 10000": "count: 400",
+    "10_000": "1_000",
+    "seeds=100": "seeds=20",
+    "--until 20": "--until 2",
+}
 """Pages are built with a million agents; here a thousand do."""
 
 
