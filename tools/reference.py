@@ -111,7 +111,7 @@ def _form(schema: Mapping[str, Any]) -> str:
     if kind == "array":
         if "prefixItems" in schema:
             return f"list of {len(schema['prefixItems'])}"
-        return "list of " + (_form(schema["items"]) if "items" in schema else "values")
+        return "list of " + ("numbers" if schema["items"] == {"type": "number"} else _form(schema["items"]))
     if kind == "object":
         return "mapping with " + ", ".join(f"`{key}`" for key in schema["properties"]) if len(schema["properties"]) < 3 else "mapping"
     low, high = schema.get("exclusiveMinimum"), schema.get("minimum")
@@ -120,11 +120,12 @@ def _form(schema: Mapping[str, Any]) -> str:
 
 
 def _code(text: str) -> str:
-    return f"`{text}`".replace("|", "\\|")
+    return f"<code>{html.escape(text, quote=False).replace('|', '&#124;')}</code>"
 
 
 def _cell(text: str) -> str:
-    return html.escape(text, quote=False).replace("|", "\\|")
+    """As it is: braces would be attributes, bars would end the cell."""
+    return html.escape(text, quote=False).replace("|", "&#124;").replace("{", "&#123;")
 
 
 def examples() -> str:

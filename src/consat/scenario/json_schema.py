@@ -56,7 +56,11 @@ def json_schema() -> Json:
         "constraints": {"type": "array", "items": {"anyOf": _references(members)}},
     }
     private = {"constraints": "each holds where its ψ is positive"}
-    about_agent = _arguments(Agent) | private | {"start": "where it stands at first, d numbers", "robot": "else as in robots"}
+    about_agent = (
+        _arguments(Agent)
+        | private
+        | {"start": "where it stands at first, d numbers", "robot": "limits of its own; the others as in robots"}
+    )
     about_group = _arguments(Group) | private | {"group": _arguments(Group)["name"], "scatter": "how far from its place a member starts"}
     whole = {
         "consat": {"const": VERSION, "description": "the version of the format"},
