@@ -2,8 +2,8 @@
 
     maximise Σ_c t_c   subject to   c_k + b_k·y + ½ yᵀH_k y ≥ t_c for each constraint k of cluster c,   ‖y_i‖ ≤ Δ_i
 
-With −H = FᵀF a constraint is the second-order cone ‖(√2 F y, w − 1)‖ ≤ w + 1, w = c + b·y − t. The clusters share no variable, so one
-program maximises every one of them. Each is brought to its own units first, whether it was written in millimetres or in kilometres.
+With −H = FᵀF a constraint is the second-order cone ‖(√2 F y, w − 1)‖ ≤ w + 1, w = c + b·y − t. Clusters share no variable, so one program
+maximises all of them. Each cluster is scaled to its own units first, so that the unit of length does not matter.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from scipy import sparse
 from consat.certify.quadratics import Block, Expansion, Floats, Ints
 
 FLAT = 1e-12
-"""Eigenvalues below this part of the largest are rounding."""
+"""Eigenvalues below this fraction of the largest count as 0."""
 STRAIGHT = 1e-6
-"""A curvature below this part of the largest says nothing of the size of ψ."""
+"""Eigenvalues below this fraction of the largest are ignored when the scale of ψ is estimated."""
 TOLERANCE = 1e-9
-"""Clarabel's relative gap and residuals, in units of a cluster's own scale; 1e-8 is its default, 1e-10 is out of reach at times."""
+"""Clarabel's tolerance for gap and residuals, in the units of a cluster. Its default is 1e-8; 1e-10 is not always reached."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What the solver found.
+    """The result of the solver.
 
     Attributes:
-        step: (N, d) y, zero for agents that no constraint reads.
-        multipliers: (M,) λ, sum to 1 within each cluster that has constraints.
+        step: (N, d) y, length; 0 for agents that no constraint reads.
+        multipliers: (M,) λ, which sum to 1 within each cluster that has constraints.
         status: "solved", "unbounded" (the margin has no upper limit) or "failed".
     """
 
@@ -42,19 +42,21 @@ class Solution:
 
 @dataclass(frozen=True)
 class Units:
-    """The units (C,) of length and ψ in each cluster."""
+    """(C,) units of length and of ψ for each cluster."""
 
     length: Floats
     psi: Floats
 
 
 def units(model: Expansion, group: Ints, count: int) -> Units:
-    """Typical sizes in each cluster: the value and the radius of a curved ψ about its top, the slope of a flat one over that length.
+    """Typical sizes of length and ψ in each cluster.
+
+    For a curved ψ: its value at the stationary point, and the corresponding radius. For an affine ψ: its slope times that length.
 
     Args:
-        model: with concave Hessians.
-        group: (M,) the cluster of each constraint.
-        count: C.
+        model: expansion with negative semidefinite Hessians.
+        group: (M,) cluster of each constraint.
+        count: C, the number of clusters.
     """
     top, bend, slope = (np.zeros(len(group)) for _ in range(3))
     for block in model.blocks:
@@ -73,21 +75,21 @@ def units(model: Expansion, group: Ints, count: int) -> Units:
 
 
 def _typical(sizes: Floats, counted: np.ndarray, group: Ints, count: int, default: Floats) -> Floats:
-    """The geometric mean in each group."""
+    """(C,) geometric mean, in each group, of the sizes that are `counted`; `default` where there are none."""
     number = np.bincount(group[counted], minlength=count)
     logs = np.bincount(group[counted], np.log(sizes[counted]), minlength=count)
     return np.where(number > 0, np.exp(logs / np.maximum(number, 1)), default)
 
 
 def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None = None, ceiling: Floats | None = None) -> Solution:
-    """Maximise the smallest ψ of every cluster.
+    """Maximise the smallest ψ of each cluster.
 
     Args:
-        model: with concave Hessians.
-        cluster: (N,) the cluster of each agent.
-        group: (M,) the cluster of each constraint.
-        trust: (N,) how far each agent may move, length; None: as far as it likes.
-        ceiling: (C,) the margin need not exceed this many units of ψ of its cluster; None: no limit.
+        model: expansion with negative semidefinite Hessians.
+        cluster: (N,) cluster of each agent.
+        group: (M,) cluster of each constraint.
+        trust: (N,) radius of the trust region of each agent, length; None: no limit.
+        ceiling: (C,) upper limit of the margin of each cluster, in its units of ψ; None: no limit.
     """
     count, dimension = int(cluster.max(initial=-1)) + 1, model.at.shape[1]
     unit = units(model, group, count)
@@ -107,7 +109,7 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
     for block in model.blocks:
         for number, F, b, columns in _by_rank(block):
             psi = unit.psi[group[number]][:, None]
-            entries = np.column_stack([-b * length[columns] / psi, np.ones(len(number))])  # t − w, but for what is constant
+            entries = np.column_stack([-b * length[columns] / psi, np.ones(len(number))])  # t − w without its constant
             above = _rows(entries, np.column_stack([place[columns], moves + which[number]]), moves + levels)
             scaled = F * (np.sqrt(2.0) * length[columns] / np.sqrt(psi))[:, None, :]
             flat = _rows(-scaled.reshape(-1, F.shape[2]), np.repeat(place[columns], F.shape[1], axis=0), moves + levels)
@@ -124,20 +126,20 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
     step, multipliers = nothing
     step[read] = solution[:moves] * length[read.ravel()]
     for number, dual in zip(constraints, duals[first:], strict=False):
-        # w stands in both ends of the cone, w + 1 and w − 1
+        # in a cone w appears in the head (w + 1) and in the last row (w − 1)
         multipliers[number] = dual[:, 0] if dual.shape[1] == 1 else dual[:, 0] + dual[:, -1]
     return Solution(step, normalised(multipliers, group, count), "solved")
 
 
 @dataclass(frozen=True)
 class Cones:
-    """Cones of one size: offset − matrix·v lies in them, one after the other; those of size 1 are half-lines.
+    """Cones of one size, into which offset − matrix·v must fall. Cones of size 1 are half-lines, v ≥ 0.
 
     Attributes:
         matrix: (members·size, V).
         offset: (members·size,).
-        members: how many.
-        size: of each.
+        members: number of cones.
+        size: rows of each cone.
     """
 
     matrix: sparse.csr_array
@@ -147,12 +149,12 @@ class Cones:
 
 
 def _epigraph(above: sparse.csr_array, value: Floats, flat: sparse.csr_array) -> Cones:
-    """w ≥ ½ ‖F y‖² for every member.
+    """The constraint w ≥ ½ ‖F y‖² for each member, w = value − above·v.
 
     Args:
-        above: (m, V), −w but for its constant.
-        value: (m,) that constant.
-        flat: (m·rank, V), −√2 F y, member by member.
+        above: (m, V).
+        value: (m,).
+        flat: (m·rank, V) matrix of −√2 F y, concatenated over the members.
     """
     members, rank = len(value), flat.shape[0] // len(value)
     if not rank:
@@ -165,7 +167,13 @@ def _epigraph(above: sparse.csr_array, value: Floats, flat: sparse.csr_array) ->
 
 
 def _balls(radius: Floats, columns: Ints, width: int) -> Cones:
-    """‖y_i‖ ≤ r_i: radius (n,), columns (n, d) of the moves."""
+    """The constraint ‖y_i‖ ≤ r_i for each agent.
+
+    Args:
+        radius: (n,) r.
+        columns: (n, d) columns of y.
+        width: V, the number of columns of the matrix.
+    """
     members, size = len(radius), columns.shape[1] + 1
     rows = (size * np.arange(members)[:, None] + np.arange(1, size)).ravel()
     matrix = sparse.csr_array((-np.ones(len(rows)), (rows, columns.ravel())), shape=(members * size, width))
@@ -178,7 +186,7 @@ def _solve(slope: Floats, cones: list[Cones]) -> tuple[Floats, list[Floats]] | s
     """Minimise slope·v over the cones.
 
     Returns:
-        v and the dual of every group of cones, (members, size); or why there is none, a status of `Solution`.
+        v and, for each group of cones, the duals, shape (members, size); a status of `Solution` if there is no solution.
     """
     import clarabel
 
@@ -192,7 +200,7 @@ def _solve(slope: Floats, cones: list[Cones]) -> tuple[Floats, list[Floats]] | s
     status = clarabel.SolverStatus
     if found.status in (status.DualInfeasible, status.AlmostDualInfeasible):
         return "unbounded"
-    if found.status not in (status.Solved, status.AlmostSolved):  # the second may be inaccurate: whoever uses the answer evaluates it
+    if found.status not in (status.Solved, status.AlmostSolved):  # AlmostSolved may be inaccurate: callers evaluate the result themselves
         return "failed"
     ends = np.cumsum([each.members * each.size for each in cones])[:-1]
     duals = np.split(np.asarray(found.z), ends)
@@ -210,20 +218,32 @@ def _shapes(cones: list[Cones]) -> Iterator[Any]:
 
 
 def normalised(weights: Floats, group: Ints, count: int) -> Floats:
-    """Weights ≥ 0 that sum to 1 within each group; those of a group without any stay 0."""
+    """Weights clipped at 0 and scaled to sum to 1 within each group. Groups without positive weights stay at 0.
+
+    Args:
+        weights: (M,).
+        group: (M,) group of each weight.
+        count: number of groups.
+    """
     weights = np.maximum(weights, 0.0)
     total = np.bincount(group, weights, minlength=count)
     return weights / np.where(total > 0, total, 1.0)[group]
 
 
 def _rows(entries: Floats, columns: Ints, size: int) -> sparse.csr_array:
-    """A sparse matrix with as many entries in every row."""
+    """A sparse matrix with the same number of entries in each row.
+
+    Args:
+        entries: (rows, width).
+        columns: (rows, width) column of each entry.
+        size: number of columns of the matrix.
+    """
     rows, width = entries.shape
     return sparse.csr_array((entries.ravel(), columns.ravel(), np.arange(rows + 1) * width), shape=(rows, size))
 
 
 def _by_rank(block: Block) -> list[tuple[Ints, Floats, Floats, Ints]]:
-    """The members by the rank of −H = FᵀF: their numbers, F (m, rank, n), b and columns."""
+    """The members of a block, split by the rank of −H = FᵀF: for each rank their numbers, F (m, rank, n), b and columns."""
     eigenvalues, vectors = np.linalg.eigh(-block.hessian)
     curved = eigenvalues > FLAT * np.abs(eigenvalues).max(axis=1, keepdims=True)
     ranks, n = curved.sum(axis=1), block.columns.shape[1]
