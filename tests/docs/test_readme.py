@@ -1,25 +1,40 @@
-"""Everything that the documents tell a reader to type works: the two marked commands, the Python examples, the scenarios."""
+"""Everything that the documents tell a reader to type works: the two marked commands, the examples, the scenarios."""
 
+import os
 import re
 import shlex
 import subprocess
 import sys
 import sysconfig
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+from consat.cli import main
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 
 
+SMALLER = {
+    "count=1000000": "count=1000",
+    "count: 10000": "count: 400",
+    "10_000": "1_000",
+    "seeds=100": "seeds=20",
+    "--until 20": "--until 2",
+}
+"""Pages are built with a million agents; here a thousand do."""
+
+
 class Block(NamedTuple):
-    """A fenced block of a document."""
+    """A fenced block of a document; `options` follow the language, as in ``console exec="on"``."""
 
     language: str
+    options: dict[str, str]
     text: str
     line: int
     marker: str | None
@@ -28,8 +43,10 @@ class Block(NamedTuple):
 def blocks(document: Path) -> Iterator[Block]:
     """The fenced blocks of a document; `marker` is the word of an HTML comment on the line right above, as in ``<!-- test -->``."""
     text = document.read_text()
-    for match in re.finditer(r"(?:^<!-- (\w+) -->\n+)?^```(\w*)\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL):
-        yield Block(match[2], match[3], text.count("\n", 0, match.start(3)) + 1, match[1])
+    for match in re.finditer(r"(?:^<!-- (\w+) -->\n+)?^```(\w*)( [^\n]*)?\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL):
+        options = dict(re.findall(r'(\w+)="(.*?)"', match[3] or ""))
+        source = re.sub("|".join(SMALLER), lambda size: SMALLER[size[0]], match[4])
+        yield Block(match[2], options, source, text.count("\n", 0, match.start(4)) + 1, match[1])
 
 
 def named(document: Path) -> str:
@@ -62,15 +79,34 @@ def test_test_command_runs_every_test() -> None:
     assert command("test").split(" && ")[-1] == ".venv/bin/pytest"
 
 
+def typed(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    """The exit code of what stands after a prompt; ours run in this process, which has compiled already."""
+    words = shlex.split(line)
+    if words[0] != "consat":
+        return subprocess.run(words, check=False).returncode
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "argv", words)
+        patch.setattr(os, "environ", dict(os.environ))
+        with pytest.raises(SystemExit) as left:
+            main()
+    return int(left.value.code or 0)
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_python_examples_run(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One after the other in one namespace, as a reader would paste them."""
+def test_examples_of_a_document_run(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One after the other, as a reader would type them; Python in a namespace for each session."""
     monkeypatch.chdir(tmp_path)
-    namespace: dict[str, object] = {"__name__": "__main__"}
+    sessions: defaultdict[str, dict[str, object]] = defaultdict(lambda: {"__name__": "__main__"})
     for block in blocks(document):
+        if name := block.options.get("title"):
+            Path(name).write_text(block.text, encoding="utf-8")
         if block.language == "python":
             source = "\n" * (block.line - 1) + block.text  # a traceback shows the line of the document
-            exec(compile(source, document, "exec"), namespace)  # noqa: S102
+            exec(compile(source, document, "exec"), sessions[block.options.get("session", "")])  # noqa: S102
+        if block.language == "console" and "exec" in block.options:
+            for line in re.findall(r"^\$ (.*)", block.text, flags=re.MULTILINE):
+                code = typed(line, monkeypatch)
+                assert code == int(block.options.get("returncode", "0")), f"{named(document)}, line {block.line}: {line} exits with {code}"
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)

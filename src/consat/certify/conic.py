@@ -1,4 +1,4 @@
-"""The max-min of concave quadratic models, as a cone program solved by Clarabel through cvxpy.
+"""The max-min of concave quadratic models, as a cone program solved by Clarabel.
 
     maximise Σ_c t_c   subject to   c_k + b_k·y + ½ yᵀH_k y ≥ t_c for each constraint k of cluster c,   ‖y_i‖ ≤ Δ_i
 
@@ -8,7 +8,7 @@ maximises all of them. Each cluster is scaled to its own units first, so that th
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,8 +91,6 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
         trust: (N,) radius of the trust region of each agent, length; None: no limit.
         ceiling: (C,) upper limit of the margin of each cluster, in its units of ψ; None: no limit.
     """
-    import cvxpy as cp
-
     count, dimension = int(cluster.max(initial=-1)) + 1, model.at.shape[1]
     unit = units(model, group, count)
     read = np.zeros(model.at.shape, dtype=bool)
@@ -103,59 +101,120 @@ def maximise(model: Expansion, cluster: Ints, group: Ints, trust: Floats | None 
         return Solution(*nothing, "solved")
     place, length = np.cumsum(read) - 1, np.repeat(unit.length[cluster], dimension)
     active, which = np.unique(group, return_inverse=True)
-    u, t = cp.Variable(int(read.sum())), cp.Variable(len(active))
-    constraints: list[Any] = [] if ceiling is None else [t <= ceiling[active]]
-    duals: list[tuple[Ints, Any]] = []
+    moves, levels = int(read.sum()), len(active)
+    cones: list[Cones] = []
+    if ceiling is not None:
+        cones.append(Cones(_rows(np.ones((levels, 1)), moves + np.arange(levels)[:, None], moves + levels), ceiling[active], levels, 1))
+    constraints: list[Ints] = []
     for block in model.blocks:
         for number, F, b, columns in _by_rank(block):
             psi = unit.psi[group[number]][:, None]
-            slack = _rows(b * length[columns] / psi, place[columns], u.size) @ u + model.value[number] / psi[:, 0] - t[which[number]]
+            entries = np.column_stack([-b * length[columns] / psi, np.ones(len(number))])  # t − w without its constant
+            above = _rows(entries, np.column_stack([place[columns], moves + which[number]]), moves + levels)
             scaled = F * (np.sqrt(2.0) * length[columns] / np.sqrt(psi))[:, None, :]
-            flat = _rows(scaled.reshape(-1, F.shape[2]), np.repeat(place[columns], F.shape[1], axis=0), u.size)
-            constraints.append(_cone(slack, flat @ u if F.shape[1] else None, len(number)))
-            duals.append((number, constraints[-1]))
+            flat = _rows(-scaled.reshape(-1, F.shape[2]), np.repeat(place[columns], F.shape[1], axis=0), moves + levels)
+            constraints.append(number)
+            cones.append(_epigraph(above, model.value[number] / psi[:, 0], flat))
+    first = len(cones) - len(constraints)
     if trust is not None:
         held = read.all(axis=1)
-        radius = (trust / unit.length[cluster])[held]
-        constraints.append(cp.SOC(radius, cp.reshape(u, (dimension, len(radius)), order="F"), axis=0))
-    status = _solve(cp.Problem(cp.Maximize(cp.sum(t)), constraints))
-    if status != "solved":
-        return Solution(*nothing, status)
+        cones.append(_balls((trust / unit.length[cluster])[held], place.reshape(-1, dimension)[held], moves + levels))
+    found = _solve(np.repeat([0.0, -1.0], [moves, levels]), cones)
+    if isinstance(found, str):
+        return Solution(*nothing, found)
+    solution, duals = found
     step, multipliers = nothing
-    step[read] = u.value * length[read.ravel()]
-    for number, constraint in duals:
-        multipliers[number] = _multiplier(constraint)
-    return Solution(step, normalised(multipliers, group, count), status)
+    step[read] = solution[:moves] * length[read.ravel()]
+    for number, dual in zip(constraints, duals[first:], strict=False):
+        # in a cone w appears in the head (w + 1) and in the last row (w − 1)
+        multipliers[number] = dual[:, 0] if dual.shape[1] == 1 else dual[:, 0] + dual[:, -1]
+    return Solution(step, normalised(multipliers, group, count), "solved")
 
 
-def _cone(slack: Any, flat: Any, members: int) -> Any:
-    """The constraint w ≥ ½ ‖F y‖² for each member.
+@dataclass(frozen=True)
+class Cones:
+    """Cones of one size, into which offset − matrix·v must fall. Cones of size 1 are half-lines, v ≥ 0.
+
+    Attributes:
+        matrix: (members·size, V).
+        offset: (members·size,).
+        members: number of cones.
+        size: rows of each cone.
+    """
+
+    matrix: sparse.csr_array
+    offset: Floats
+    members: int
+    size: int
+
+
+def _epigraph(above: sparse.csr_array, value: Floats, flat: sparse.csr_array) -> Cones:
+    """The constraint w ≥ ½ ‖F y‖² for each member, w = value − above·v.
 
     Args:
-        slack: (members,) w.
-        flat: √2 F y, concatenated over the members; None if they have no curvature.
-        members: number of members.
+        above: (m, V).
+        value: (m,).
+        flat: (m·rank, V) matrix of −√2 F y, concatenated over the members.
     """
-    import cvxpy as cp
+    members, rank = len(value), flat.shape[0] // len(value)
+    if not rank:
+        return Cones(above, value, members, 1)
+    order = np.column_stack([
+        np.arange(members), members + np.arange(members * rank).reshape(members, rank), members * (rank + 1) + np.arange(members)
+    ]).ravel()  # fmt: skip
+    offset = np.concatenate([value + 1, np.zeros(members * rank), value - 1])
+    return Cones(sparse.vstack([above, flat, above], format="csr")[order], offset[order], members, rank + 2)
 
-    if flat is None:
-        return slack >= 0
-    tall = cp.vstack([cp.reshape(flat, (flat.size // members, members), order="F"), cp.reshape(slack - 1, (1, members), order="F")])
-    return cp.SOC(slack + 1, tall, axis=0)
+
+def _balls(radius: Floats, columns: Ints, width: int) -> Cones:
+    """The constraint ‖y_i‖ ≤ r_i for each agent.
+
+    Args:
+        radius: (n,) r.
+        columns: (n, d) columns of y.
+        width: V, the number of columns of the matrix.
+    """
+    members, size = len(radius), columns.shape[1] + 1
+    rows = (size * np.arange(members)[:, None] + np.arange(1, size)).ravel()
+    matrix = sparse.csr_array((-np.ones(len(rows)), (rows, columns.ravel())), shape=(members * size, width))
+    offset = np.zeros(members * size)
+    offset[::size] = radius
+    return Cones(matrix, offset, members, size)
 
 
-def _solve(problem: Any) -> str:
-    import cvxpy as cp
+def _solve(slope: Floats, cones: list[Cones]) -> tuple[Floats, list[Floats]] | str:
+    """Minimise slope·v over the cones.
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about inaccurate solutions: callers evaluate the result themselves
-            problem.solve(solver=cp.CLARABEL, tol_gap_abs=TOLERANCE, tol_gap_rel=TOLERANCE, tol_feas=TOLERANCE)
-    except cp.SolverError:
-        return "failed"
-    if problem.status in (cp.UNBOUNDED, cp.UNBOUNDED_INACCURATE):
+    Returns:
+        v and, for each group of cones, the duals, shape (members, size); a status of `Solution` if there is no solution.
+    """
+    import clarabel
+
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
+    shapes = list(_shapes(cones))
+    matrix = sparse.csc_matrix(sparse.vstack([each.matrix for each in cones], format="csc"))
+    nothing = sparse.csc_matrix((len(slope), len(slope)))
+    found = clarabel.DefaultSolver(nothing, slope, matrix, np.concatenate([each.offset for each in cones]), shapes, settings).solve()
+    status = clarabel.SolverStatus
+    if found.status in (status.DualInfeasible, status.AlmostDualInfeasible):
         return "unbounded"
-    return "solved" if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else "failed"
+    if found.status not in (status.Solved, status.AlmostSolved):  # AlmostSolved may be inaccurate: callers evaluate the result themselves
+        return "failed"
+    ends = np.cumsum([each.members * each.size for each in cones])[:-1]
+    duals = np.split(np.asarray(found.z), ends)
+    return np.asarray(found.x), [dual.reshape(each.members, each.size) for dual, each in zip(duals, cones, strict=True)]
+
+
+def _shapes(cones: list[Cones]) -> Iterator[Any]:
+    import clarabel
+
+    for each in cones:
+        if each.size == 1:
+            yield clarabel.NonnegativeConeT(each.members)
+        else:
+            yield from (clarabel.SecondOrderConeT(each.size) for _ in range(each.members))
 
 
 def normalised(weights: Floats, group: Ints, count: int) -> Floats:
@@ -169,16 +228,6 @@ def normalised(weights: Floats, group: Ints, count: int) -> Floats:
     weights = np.maximum(weights, 0.0)
     total = np.bincount(group, weights, minlength=count)
     return weights / np.where(total > 0, total, 1.0)[group]
-
-
-def _multiplier(constraint: Any) -> Floats:
-    """(members,) dual of w ≥ …. In a cone, w appears in the head (w + 1) and in the last row (w − 1), so both duals are added."""
-    dual = constraint.dual_value
-    if isinstance(dual, list):
-        head, tail = np.atleast_1d(dual[0]), np.atleast_2d(dual[1])
-        return head + tail.reshape(-1, len(head))[-1]
-
-    return np.atleast_1d(dual)
 
 
 def _rows(entries: Floats, columns: Ints, size: int) -> sparse.csr_array:

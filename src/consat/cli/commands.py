@@ -21,6 +21,7 @@ from consat.cli.export import export, result_argument, show
 from consat.cli.keys import keys
 from consat.cli.live import live
 from consat.cli.network import agent, launch, split
+from consat.cli.schema import schema
 from consat.cli.terminal import (
     DONE,
     FAILED,
@@ -372,7 +373,7 @@ def _file(result: Path) -> Path:
     return result / RESULT if result.is_dir() else result
 
 
-for command in (split, agent, launch, keys, export, show, live, doctor):
+for command in (split, agent, launch, keys, export, show, live, schema, doctor):
     cli.add_command(command)
 add_examples(cli)
 

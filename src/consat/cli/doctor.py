@@ -19,7 +19,7 @@ from consat.cli.terminal import DONE, FAILED, json_option
 from consat.network.deploy.environment import keep_compilations
 
 SCHEMA: Final = "consat.doctor/1"
-LIBRARIES: Final = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "cvxpy-base", "clarabel", "xarray", "h5netcdf", "matplotlib", "click")
+LIBRARIES: Final = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "clarabel", "xarray", "h5netcdf", "matplotlib", "click")
 EXTRAS: Final[Mapping[str, Sequence[str]]] = {
     "live": ("starlette", "uvicorn", "websockets"),
     "mcap": ("foxglove-sdk",),

@@ -24,6 +24,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
         "consat run case-c --protocol gradient-flow --estimates full --until 300",
         "consat run swarm --set count=1000 --json",
     ),
+    "schema": ("consat schema --out consat.schema.json",),
     "show": ("consat show runs/case-b", "consat show runs/case-b --out page.html"),
     "solve": ("consat solve case-c", "consat solve my-team.yaml --set agents.a1.constraints.0.radius=2 --json"),
     "split": ("consat split case-b --out parts", "consat split case-b --out parts --address a2=tcp/192.168.0.7:7447"),
