@@ -53,6 +53,7 @@ def run(
     obstacles: Sequence[Any] | None = None,
     wind: Sequence[float] = (),
     noise: float = 0.0,
+    simulator: str | None = None,
     auxiliary: float | None = None,
     restarts: int = 1,
     record: bool | None = None,
@@ -87,6 +88,7 @@ def run(
         obstacles: what `consat.disc` and its like return, which robots keep clear of; by default those of the scenario.
         wind: (d,) velocity of the air, m/s, for robots.
         noise: the most that a robot's measured position is wrong by, m.
+        simulator: integrates the bodies of robots: ``mujoco``, or, if None, the robots' own models.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         restarts: runs from so many starts, of this seed and those after it, as one computation, and tells of the one that ends with the
             largest margin. In rounds only.
@@ -110,7 +112,7 @@ def run(
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
-        wind=tuple(map(float, wind)), noise=noise, restarts=restarts,
+        wind=tuple(map(float, wind)), noise=noise, simulator=simulator, restarts=restarts,
         burst=None if burst is None else tuple(map(float, burst)),  # type: ignore[arg-type]
     )  # fmt: skip
     if checkpoint is not None and out is None:

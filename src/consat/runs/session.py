@@ -100,6 +100,7 @@ class Session:
         obstacles: what robots keep clear of, as in `consat.run`.
         wind: as in `consat.run`.
         noise: as in `consat.run`.
+        simulator: as in `consat.run`.
 
     Raises:
         InvalidTeam: agents that depend on each other cannot reach one another (Assumption 1).
@@ -113,12 +114,13 @@ class Session:
         start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
         burst: tuple[float, float] | None = None,
         rate: float | None = None, speed: float | None = None, robots: Any = None, obstacles: Sequence[Any] | None = None,
-        wind: Sequence[float] = (), noise: float = 0.0,
+        wind: Sequence[float] = (), noise: float = 0.0, simulator: str | None = None,
     ) -> None:  # fmt: skip
         scenario = scenario_of(team)
         self._options = Options(
             protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, burst=burst,
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
+            simulator=simulator,
             robots=robots_of(robots, obstacles, scenario),
         )  # fmt: skip
         self._name = scenario.name
