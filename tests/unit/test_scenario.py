@@ -58,7 +58,7 @@ def best_margin(team: cs.Team) -> float:
 
 # The packaged scenarios.
 
-DRIVEN = ("corridor", "escort", "swap", "warehouse")
+DRIVEN = ("corridor", "drones", "escort", "swap", "warehouse")
 """Those of robots."""
 
 
