@@ -1,8 +1,8 @@
 """Bodies in MuJoCo: quadrotors and differential drives, made of primitive shapes and written as MJCF, among the obstacles of the map.
 
 A quadrotor has four rotors whose thrust is limited, under the geometric controller of `consat.robots.quadrotor`; a differential drive has
-two driven wheels and a caster on a floor with friction, and follows its reference by wheel speeds (Kanayama et al., ICRA 1990). All have
-the same drag in the air. Contacts are MuJoCo's, between what the models call bodies: the ball of a quadrotor, the disc of a drive.
+two driven wheels and a caster on a floor with friction, and its steered point follows that of the reference. All have the same drag in the
+air. Contacts are MuJoCo's, between what the models call bodies: the ball of a quadrotor, the disc of a drive.
 """
 
 from __future__ import annotations
@@ -46,14 +46,16 @@ WHEEL, TRACK, CASTER = 0.35, 0.85, 0.75
 """Of a drive, in radii: radius of its wheels, half the distance between them, and how far the caster is behind the axle."""
 HIGH, BEHIND = 0.3, 0.2
 """In radii: how high the middle of its mass is above the floor, and how far behind the axle."""
+SPIN = 0.4
+"""Moment of inertia about the vertical, in mass·radius²."""
 SERVO, GRIP = 0.01, 6.0
 """Time constant of the wheels' speed loop, s, and the acceleration that their motors are good for, m/s²."""
-FORTH, TURN, SIDE = 8.0, 10.0, 25.0
-"""Of the loop that follows the reference: 1/s along, 1/s in heading, and 1/s² to the side, at top speed."""
+FOLLOWING = 8.0
+"""Of the loop that follows the reference, 1/s."""
 MORE = 1.25
 """How much more than the reference's limits it may ask for."""
-REST = 0.015
-"""What the tube of a drive is wider than its way to come to a halt, m."""
+REST = 0.01
+"""What the tube of a drive is wider than its motors make it, m."""
 
 
 class _Physics(NamedTuple):
@@ -283,25 +285,30 @@ def _quadrotor(world: ElementTree.Element, actuators: ElementTree.Element, name:
 
 
 def _rolled(kind: Unicycle, before: UnicycleState, after: UnicycleState, dt: float) -> _Control:
-    """The speeds of two wheels, rad/s."""
+    """The speeds of two wheels, rad/s: the steered point ahead of the axle follows that of the reference."""
     axle, angle, half = np.asarray(before.axle), np.asarray(before.angle), 0.5 * np.asarray(after.angle - before.angle)
     chord = np.sum((after.axle - axle) * _ahead(angle + half), axis=1)
     pace, rate = chord / (dt * np.sinc(half / np.pi)), 2.0 * half / dt
-    top, most, radius = (np.broadcast_to(value, len(angle)) for value in (kind.speed, kind.turn_rate, kind.radius))
+    top, most, radius, offset = (np.broadcast_to(value, len(angle)) for value in (kind.speed, kind.turn_rate, kind.radius, kind.offset))
 
     def control(now: _Now, time: float, hold: float) -> tuple[np.ndarray, np.ndarray]:
         turned = rate * time
-        there = axle + (pace * time * np.sinc(0.5 * turned / np.pi))[:, None] * _ahead(angle + 0.5 * turned)
-        heading = np.arctan2(now.attitude[:, 1, 0], now.attitude[:, 0, 0])
-        error, turn, ahead = there - now.place[:, :2], angle + turned - heading, _ahead(heading)
-        forth = np.sum(error * ahead, axis=1)
-        side = error[:, 1] * ahead[:, 0] - error[:, 0] * ahead[:, 1]
-        v = np.clip(pace * np.cos(turn) + FORTH * forth, -MORE * top, MORE * top)
-        w = np.clip(rate + TURN * np.sin(turn) + SIDE * pace / top**2 * side, -MORE * most, MORE * most)
-        wheels = np.stack([v - w * TRACK * radius, v + w * TRACK * radius], axis=1)
-        return wheels / (WHEEL * radius)[:, None], now.push
+        there, ahead = _ahead(angle + turned), now.attitude[:, :2, 0]
+        middle = axle + (pace * time * np.sinc(0.5 * turned / np.pi))[:, None] * _ahead(angle + 0.5 * turned)
+        error = middle + offset[:, None] * there - now.place[:, :2] - offset[:, None] * ahead
+        wish = pace[:, None] * there + (offset * rate)[:, None] * _across(there) + FOLLOWING * error
+        v, w = np.sum(wish * ahead, axis=1), np.sum(wish * _across(ahead), axis=1) / offset
+        part = np.minimum(1.0, MORE / np.maximum(np.abs(v) / top, np.maximum(np.abs(w) / most, 1e-9)))
+        wheels = (part / (WHEEL * radius))[:, None] * np.stack([v - w * TRACK * radius, v + w * TRACK * radius], axis=1)
+        return wheels, now.push
 
     return control
+
+
+def _late(kind: Unicycle) -> Any:
+    """How far a drive may fall behind a reference that halts, sets out and turns at once, m; measured with random commands."""
+    spin = (SPIN * kind.radius) / (TRACK * GRIP)  # 1 / angular acceleration, s²
+    return kind.speed * (kind.speed / GRIP + kind.turn_rate * spin) + REST
 
 
 def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:
@@ -310,7 +317,7 @@ def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str
     body = _add(world, "body", name=name)
     _add(body, "freejoint")
     middle = (-BEHIND * radius, 0, HIGH * radius - wheel)
-    _add(body, "inertial", pos=middle, mass=1, diaginertia=radius**2 * np.array([0.2, 0.2, 0.4]))
+    _add(body, "inertial", pos=middle, mass=1, diaginertia=radius**2 * np.array([0.5, 0.5, 1.0]) * SPIN)
     _add(body, "geom", type="cylinder", pos=(0, 0, 0.15 * radius), size=(radius, 0.4 * radius), rgba="0.3 0.5 0.8 1", **SOLID)
     nose, bar = radius * np.array([0.6, 0, 0.56]), radius * np.array([0.25, 0.06, 0.02])
     _add(body, "geom", type="box", pos=nose, size=bar, rgba="1 1 1 1", **SHOWN)
@@ -327,8 +334,7 @@ def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str
 
 DESIGNS: dict[type, _Design] = {
     Quadrotor: _Design(0.005, 4, 0, 0.0, lambda kind: kind.tube, _quadrotor, _flown),
-    # a reference halts at once, a body does not
-    Unicycle: _Design(0.0025, 2, 2, WHEEL, lambda kind: kind.speed**2 / (2.0 * GRIP) + REST, _drive, _rolled),
+    Unicycle: _Design(0.0025, 2, 2, WHEEL, _late, _drive, _rolled),
 }
 """The kinds of robots that have a body here."""
 
@@ -402,6 +408,10 @@ def _in_space(vectors: Any) -> np.ndarray:
 
 def _ahead(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _across(ahead: np.ndarray) -> np.ndarray:
+    return np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
 
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 What commands move is a reference: the robot's model, stepped exactly, which the safety filter keeps apart from others. The simulator's body
 follows it with a controller of its own. Bodies stay within `tube` of their references, which is a condition of the theorem in
-docs/robots.md; a reference whose body is farther away halts and waits for it. Positions and headings are those that the simulator measures.
+docs/robots.md; a reference whose body is farther away than half of that halts and waits for it. Positions and headings are those that the simulator measures.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ from consat.robots.quadrotor import Quadrotor
 
 SIMULATORS: Final = ("mujoco",)
 """Modules of `consat.robots`, each with a class `Simulator`: a new one is one file, and its name here."""
+
+
+WAITS = 0.5
+"""Of its tube: a reference waits for a body that is farther away."""
 
 
 class Bodies(NamedTuple):
@@ -59,7 +63,7 @@ class Simulator(Protocol):
 
     @property
     def tube(self) -> np.ndarray:
-        """(N,) how far a body may be from its reference, m."""
+        """(N,) how far a body's position, see `Simulated.position`, may be from its reference, m."""
 
     def start(self, place: np.ndarray) -> Bodies:
         """Bodies at rest at (N, d) places of their references, with heading 0."""
@@ -144,7 +148,7 @@ class Simulated:
     def step(self, state: SimulatedState, command: Array, dt: float, wind: Array | None = None) -> SimulatedState:
         """The reference moves as its model does, unless its body is left behind; the simulator's body follows. Wind is the body's."""
         before, body = state.reference, self.body(state)
-        behind = jnp.linalg.norm(body - self.reference.body(before), axis=1) > jnp.asarray(self.simulator.tube)
+        behind = jnp.linalg.norm(self.position(state) - self.reference.place(before), axis=1) > WAITS * jnp.asarray(self.simulator.tube)
         command = jnp.where(behind[:, None], self.reference.halt(before, dt), command)
         after = self.reference.step(before, command, dt)
         air = jnp.zeros_like(body) if wind is None else wind
