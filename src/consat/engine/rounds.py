@@ -409,7 +409,8 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
     """Of ``run --json`` what is said of robots: distances, m, contacts, who is stuck, and which conditions for that nobody
     touches did not hold."""
     if world.drive is None or now.robots is None:
-        return {"smallest_distance": None, "clearance": None, "contacts": 0, "collisions": 0, "stuck": [], "unproven": [], "simulator": None}
+        none = {"smallest_distance": None, "clearance": None, "simulator": None}
+        return none | {"contacts": 0, "collisions": 0, "stuck": [], "unproven": []}
     drive, robots = world.drive, now.robots
     report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
     noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))

@@ -2,7 +2,8 @@
 
 What commands move is a reference: the robot's model, stepped exactly, which the safety filter keeps apart from others. The simulator's body
 follows it with a controller of its own. Bodies stay within `tube` of their references, which is a condition of the theorem in
-docs/robots.md; a reference whose body is farther away than half of that halts and waits for it. Positions and headings are those that the simulator measures.
+docs/robots.md; a reference whose body is farther away than half of that halts and waits for it. Positions and headings are those that the
+simulator measures.
 """
 
 from __future__ import annotations
