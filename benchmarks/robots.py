@@ -31,7 +31,9 @@ from pyrvo import RVOSimulator
 from scipy.spatial import cKDTree
 
 import consat
-from consat.robots import Double, Drive, Planner, Point, Quadrotor, Unicycle, box, disc, simulated
+from consat.engine.round import PATH, Driven
+from consat.engine.ways import Ways
+from consat.robots import Double, Drive, Point, Quadrotor, Unicycle, box, disc, simulated
 
 RADIUS, SPEED, DT = 0.1, 0.5, 0.05
 GAIN = 100.0
@@ -83,7 +85,7 @@ def limit_of(starts: np.ndarray, goals: np.ndarray) -> float:
 
 
 CHUNK = 20
-"""Steps at a time; paths are planned anew after each."""
+"""Steps at a time; after each the robots look whether they need another way, as in `consat run`."""
 
 
 class Consat:
@@ -99,7 +101,7 @@ class Consat:
 
     def _compile(self, count, dimension, planned):
         drive = Drive(self.model, count, dimension, DT, self.obstacles)
-        planner = Planner(drive.map, float(drive.size.max())) if planned else None
+        ways = Ways(drive, CHUNK) if planned else None
 
         @jax.jit
         def chunk(state, memory, goals, paths, path):
@@ -116,19 +118,19 @@ class Consat:
             (state, memory, path, _, steps), _ = jax.lax.scan(body, start, length=CHUNK)
             return state, memory, path, steps
 
-        return drive, planner, chunk
+        return drive, ways, chunk
 
     def __call__(self, starts, goals, record=None):
-        drive, planner, chunk = self._compiled(*starts.shape, bool(self.obstacles))
+        drive, ways, chunk = self._compiled(*starts.shape, bool(self.obstacles))
         state = drive.model.start(jnp.asarray(starts))
         memory, target, path = drive.start(state), jnp.asarray(goals), jnp.zeros(len(starts))
         steps, spent, limit = 0, [], limit_of(starts, goals)
         paths = None
         while steps * DT < limit:
-            if planner is not None:
-                paths = jnp.asarray(planner.paths(np.asarray(drive.model.place(state)), goals))
-                paths = jnp.pad(paths, ((0, 0), (0, 16 - paths.shape[1]), (0, 0)), mode="edge")
-                memory = memory._replace(waypoint=jnp.zeros_like(memory.waypoint))
+            if ways is not None:
+                paths = jnp.repeat(jnp.asarray(starts)[:, None], PATH, axis=1) if paths is None else paths
+                planned = ways.planned(Driven(state, memory, paths), np.asarray(drive.model.place(state)), goals)
+                memory, paths = planned.memory, planned.paths
             if steps == 0:
                 warm = chunk(state, memory, target, paths, path)  # compiles
                 jax.block_until_ready(chunk(*warm[:2], target, paths, warm[2]))  # and once more, for what has no weak types
@@ -470,7 +472,7 @@ PARTS: dict[str, Part] = {
     ),
     "obstacles": (
         "Among obstacles",
-        "Random starts and goals among eight shelves and two pillars; paths are planned again every second.",
+        "Random starts and goals among eight shelves and two pillars; paths are planned, and planned anew, as in `consat run`.",
         obstacles,
         obstacles_told,
     ),
@@ -575,7 +577,7 @@ def picture(path: Path, crowded: list[dict[str, Any]], cluttered: list[dict[str,
         right.add_patch(Circle(record[0, index], RADIUS, fill=False, edgecolor=line.get_color()))
         right.add_patch(Circle(record[-1, index], RADIUS, color=line.get_color()))
     right.set(aspect="equal", xlabel="m", ylabel="m")
-    right.set_title(f"{AMONG} unicycles among shelves, once a second: starts (rings), ways, ends (discs)", fontsize=10)
+    right.set_title(f"{AMONG} unicycles among shelves, once a second:\nstarts (rings), ways, ends (discs)", fontsize=10)
     figure.savefig(path, dpi=110)
 
 

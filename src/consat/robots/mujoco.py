@@ -54,8 +54,8 @@ FOLLOWING = 8.0
 """Of the loop that follows the reference, 1/s."""
 MORE = 1.25
 """How much more than the reference's limits it may ask for."""
-REST = 0.01
-"""What the tube of a drive is wider than its motors make it, m."""
+REST, LAG = 0.01, 0.025
+"""Of the tube of a drive: m, and s."""
 
 
 class _Physics(NamedTuple):
@@ -150,6 +150,7 @@ class Simulator:
         self._mujoco, self._dimension = mujoco, dimension
         self._groups = [_group(kind, rows) for kind, rows in kinds]
         self.tube = self._each(lambda group: group.design.tube(group.kind))
+        self.acceleration = self._each(lambda group: GRIP if group.design.joints else np.inf)
         self._height = self._each(lambda group: group.design.height * group.radius)
         self.mjcf = _scene(self._groups, dimension, obstacles)
         self._model = compiled = mujoco.MjModel.from_xml_string(self.mjcf)
@@ -172,7 +173,9 @@ class Simulator:
         physics.place[:, 0] -= self._each(lambda group: group.kind.offset if isinstance(group.kind, Unicycle) else 0.0)
         physics.place[:, 3] = 1.0
         apart = np.zeros((count, count), dtype=bool)
-        return Bodies(physics.place[:, :3], np.zeros(count), np.concatenate(physics, axis=1), apart, apart.any(axis=1))
+        return Bodies(
+            physics.place[:, :3], physics.speed[:, :3], np.zeros(count), np.concatenate(physics, axis=1), apart, apart.any(axis=1)
+        )
 
     def step(self, bodies: Bodies, before: Any, after: Any, wind: np.ndarray, *, dt: float) -> Bodies:
         model, data, groups, count = self._model, self._data, self._groups, len(bodies.heading)
@@ -200,7 +203,7 @@ class Simulator:
         place[:, 2] -= self._height
         heading = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
         physics = _Physics(place, speed, self._speed.read(data.qacc_warmstart), push)
-        return Bodies(place[:, :3], heading, np.concatenate(physics, axis=1), touching, struck)
+        return Bodies(place[:, :3], speed[:, :3], heading, np.concatenate(physics, axis=1), touching, struck)
 
     def _look(self, touching: np.ndarray, struck: np.ndarray) -> None:
         """Add MuJoCo's contacts between two robots, and between one and an obstacle."""
@@ -306,9 +309,9 @@ def _rolled(kind: Unicycle, before: UnicycleState, after: UnicycleState, dt: flo
 
 
 def _late(kind: Unicycle) -> Any:
-    """How far a drive may fall behind a reference that halts, sets out and turns at once, m; measured with random commands."""
-    spin = (SPIN * kind.radius) / (TRACK * GRIP)  # 1 / angular acceleration, s²
-    return kind.speed * (kind.speed / GRIP + kind.turn_rate * spin) + REST
+    """How far a drive falls behind its reference, m; measured with random commands. When that halts at once its body comes to stand where
+    its steered point was, which is kept free anyway."""
+    return REST + kind.speed * (LAG + kind.turn_rate * kind.radius * LAG)
 
 
 def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:

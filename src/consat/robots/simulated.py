@@ -23,7 +23,7 @@ from consat.errors import InvalidSettings, closest
 from consat.numerics import on_host
 from consat.robots.double import Double
 from consat.robots.fleet import Fleet
-from consat.robots.model import Model
+from consat.robots.model import Model, shortened
 from consat.robots.quadrotor import Quadrotor
 
 SIMULATORS: Final = ("mujoco",)
@@ -39,6 +39,7 @@ class Bodies(NamedTuple):
 
     Attributes:
         position: (N, 3) of the body's middle, m.
+        velocity: (N, 3) of it, m/s.
         heading: (N,) rad.
         inner: (N, S) all else that the simulator must know to go on.
         touching: (N, N) pairs (i, j), i < j, that touched in the last step.
@@ -46,6 +47,7 @@ class Bodies(NamedTuple):
     """
 
     position: Any
+    velocity: Any
     heading: Any
     inner: Any
     touching: Any
@@ -64,7 +66,11 @@ class Simulator(Protocol):
 
     @property
     def tube(self) -> np.ndarray:
-        """(N,) how far a body's position, see `Simulated.position`, may be from its reference, m."""
+        """(N,) how far a body may be from its reference, m; see `Simulated.strayed`."""
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """(N,) at most, at which references set out, m/s²; infinite where their models have limits of their own."""
 
     def start(self, place: np.ndarray) -> Bodies:
         """Bodies at rest at (N, d) places of their references, with heading 0."""
@@ -141,7 +147,18 @@ class Simulated:
         return self.reference.braking(count)
 
     def command(self, state: SimulatedState, velocity: Array, dt: float) -> Array:
-        return self.reference.command(state.reference, velocity, dt)
+        """As the reference's, but no faster than the body can come to be by then: who sets out does not leave its body behind."""
+        body = state.bodies.velocity[:, : velocity.shape[1]]
+        pace = jnp.linalg.norm(velocity, axis=1)
+        along = jnp.sum(body * velocity, axis=1) / jnp.where(pace > 0.0, pace, 1.0)
+        limit = jnp.maximum(along, 0.0) + jnp.asarray(self.simulator.acceleration) * dt
+        return self.reference.command(state.reference, shortened(velocity, limit), dt)
+
+    def strayed(self, state: SimulatedState) -> Array:
+        """(N,) how far the body is out of the disc that its model keeps round its reference, m; negative inside."""
+        reference, body = state.reference, self.body(state)
+        place = self.reference.place(reference)
+        return jnp.linalg.norm(body - place, axis=1) - jnp.linalg.norm(self.reference.body(reference) - place, axis=1)
 
     def halt(self, state: SimulatedState, dt: float) -> Array:
         return self.reference.halt(state.reference, dt)
@@ -149,7 +166,7 @@ class Simulated:
     def step(self, state: SimulatedState, command: Array, dt: float, wind: Array | None = None) -> SimulatedState:
         """The reference moves as its model does, unless its body is left behind; the simulator's body follows. Wind is the body's."""
         before, body = state.reference, self.body(state)
-        behind = jnp.linalg.norm(self.position(state) - self.reference.place(before), axis=1) > WAITS * jnp.asarray(self.simulator.tube)
+        behind = self.strayed(state) > WAITS * jnp.asarray(self.simulator.tube)
         command = jnp.where(behind[:, None], self.reference.halt(before, dt), command)
         after = self.reference.step(before, command, dt)
         air = jnp.zeros_like(body) if wind is None else wind
@@ -176,7 +193,7 @@ class Simulated:
         return self.reference.reach(state.reference, dt)
 
     def _shapes(self, count: int) -> Bodies:
-        real = {"position": (count, 3), "heading": (count,), "inner": (count, self.simulator.width)}
+        real = {"position": (count, 3), "velocity": (count, 3), "heading": (count,), "inner": (count, self.simulator.width)}
         flags = {"touching": (count, count), "struck": (count,)}
         return Bodies(
             **{name: jax.ShapeDtypeStruct(shape, jnp.float64) for name, shape in real.items()},
