@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import consat as cs
+from consat.engine.carry import robot_placed
 from consat.errors import InvalidSettings
 from consat.numerics import float64, on_host, quick_compilation
 from consat.robots import Double, Drive, Fleet, Quadrotor, Simulated, Unicycle, box, disc, polygon, simulated
@@ -165,6 +166,22 @@ def test_a_drive_that_is_told_to_go_to_and_fro_stays_near_its_reference() -> Non
         strayed.append(np.asarray(model.strayed(state)))
     assert np.quantile(strayed, 0.98) < model.simulator.tube[0]
     assert np.max(strayed) < model.simulator.tube[0] + 0.03
+
+
+@float64
+def test_a_session_puts_one_body_down_and_leaves_the_others_moving() -> None:
+    model = simulated("mujoco", Fleet([Unicycle(), Quadrotor()], np.array([0, 1, 1])), 3, 2, [])
+    place = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    state = model.start(jnp.asarray(place))
+    onward = jax.jit(lambda state: model.step(state, model.command(state, jnp.ones((3, 2)), DT), DT), compiler_options=quick_compilation())
+    for _ in range(10):
+        state = onward(state)
+    placed = robot_placed(model, state, 1, np.array([[9.0, 9.0], [5.0, 4.0], [9.0, 9.0]]))
+    np.testing.assert_array_equal(model.position(placed)[1], [5.0, 4.0])
+    np.testing.assert_array_equal(placed.bodies.velocity[1], 0.0)
+    for part in (model.position, model.place, lambda state: state.bodies.inner):
+        np.testing.assert_array_equal(part(placed)[jnp.array([0, 2])], part(state)[jnp.array([0, 2])])
+    assert np.linalg.norm(placed.bodies.velocity[2]) > 0.1
 
 
 @float64
