@@ -1,22 +1,29 @@
 """Robots that swap places and cross random crowds: consat, ORCA (pyrvo), and one central QP for all as the Robotarium has it (piqp).
 
-python benchmarks/robots.py [--quick] [--out docs/benchmarks]     # pip install pyrvo piqp
-python benchmarks/robots.py --oracle 1000000                      # the filter's small problem against piqp
+    python benchmarks/robots.py [--part swaps crowds obstacles steps oracle mujoco] [--scenes 100] [--most 1000] [--out docs/benchmarks]
+
+Needs `pip install pyrvo piqp mujoco-core`. Writes ``robots.md``, ``robots.png`` and ``robots.json``, from which parts that are not asked
+for are taken as last measured. A part that is cut short keeps what it has; run it again for all of it.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import json
+import os
 import platform
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import piqp
 import scipy.sparse as sp
 from matplotlib.figure import Figure
@@ -24,8 +31,9 @@ from pyrvo import RVOSimulator
 from scipy.spatial import cKDTree
 
 import consat
-from consat.robots import Drive, Planner, Point, Quadrotor, Unicycle, box, disc
-from consat.robots.filter import nearest
+from consat.engine.round import PATH, Driven
+from consat.engine.ways import Ways
+from consat.robots import Double, Drive, Point, Quadrotor, Unicycle, box, disc, simulated
 
 RADIUS, SPEED, DT = 0.1, 0.5, 0.05
 GAIN = 100.0
@@ -36,8 +44,8 @@ TOUCH = -1e-6
 
 @dataclass
 class Outcome:
-    """Of one scene: time until all have arrived (None: never), over the straight-line time; smallest gap, m; pairs that touched; path
-    over straight line; robots that have not arrived; ms a step."""
+    """Of one scene: time until all have arrived (None: never), over the straight-line time; smallest gap, m; pairs that touched, and times
+    that an obstacle was; path over straight line; robots that have not arrived; ms a step; smallest distance to an obstacle, m."""
 
     time: float | None
     gap: float
@@ -45,6 +53,7 @@ class Outcome:
     path: float
     left: int
     step: float
+    clearance: float | None = None
 
 
 def circle(count: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +85,7 @@ def limit_of(starts: np.ndarray, goals: np.ndarray) -> float:
 
 
 CHUNK = 20
-"""Steps at a time; paths are planned anew after each."""
+"""Steps at a time; after each the robots look whether they need another way, as in `consat run`."""
 
 
 class Consat:
@@ -92,7 +101,7 @@ class Consat:
 
     def _compile(self, count, dimension, planned):
         drive = Drive(self.model, count, dimension, DT, self.obstacles)
-        planner = Planner(drive.map, float(drive.size.max())) if planned else None
+        ways = Ways(drive, CHUNK) if planned else None
 
         @jax.jit
         def chunk(state, memory, goals, paths, path):
@@ -109,19 +118,19 @@ class Consat:
             (state, memory, path, _, steps), _ = jax.lax.scan(body, start, length=CHUNK)
             return state, memory, path, steps
 
-        return drive, planner, chunk
+        return drive, ways, chunk
 
     def __call__(self, starts, goals, record=None):
-        drive, planner, chunk = self._compiled(*starts.shape, bool(self.obstacles))
+        drive, ways, chunk = self._compiled(*starts.shape, bool(self.obstacles))
         state = drive.model.start(jnp.asarray(starts))
         memory, target, path = drive.start(state), jnp.asarray(goals), jnp.zeros(len(starts))
         steps, spent, limit = 0, [], limit_of(starts, goals)
         paths = None
         while steps * DT < limit:
-            if planner is not None:
-                paths = jnp.asarray(planner.paths(np.asarray(drive.model.place(state)), goals))
-                paths = jnp.pad(paths, ((0, 0), (0, 16 - paths.shape[1]), (0, 0)), mode="edge")
-                memory = memory._replace(waypoint=jnp.zeros_like(memory.waypoint))
+            if ways is not None:
+                paths = jnp.repeat(jnp.asarray(starts)[:, None], PATH, axis=1) if paths is None else paths
+                planned = ways.planned(Driven(state, memory, paths), np.asarray(drive.model.place(state)), goals)
+                memory, paths = planned.memory, planned.paths
             if steps == 0:
                 warm = chunk(state, memory, target, paths, path)  # compiles
                 jax.block_until_ready(chunk(*warm[:2], target, paths, warm[2]))  # and once more, for what has no weak types
@@ -137,16 +146,15 @@ class Consat:
         report = memory.report
         arrived = np.asarray(drive.arrived(state, target))
         straight = np.linalg.norm(starts - goals, axis=1)
-        outcome = Outcome(
+        return Outcome(
             steps * DT * SPEED / straight.max() if arrived.all() else None,
             float(report.smallest_distance),
             int(report.contacts) + int(report.collisions),
             float(np.mean(np.asarray(path) / straight)),
             int((~arrived).sum()),
             1e3 * float(np.median(spent)),
+            float(report.clearance) if self.obstacles else None,
         )
-        outcome.clearance, outcome.stuck = float(report.clearance), drive.stuck(state, memory, target)
-        return outcome
 
 
 def loop(starts, goals, move) -> Outcome:
@@ -215,87 +223,70 @@ def central(starts, goals):
     return loop(starts, goals, move)
 
 
-def oracle(count: int) -> str:
-    """Random problems of up to 8 rows, some of them infeasible or flat against each other: the filter's answers and piqp's."""
-    rng, worst, differ, infeasible = np.random.default_rng(0), 0.0, 0, 0
-    compiled = jax.jit(nearest)
-    begin, done = time.perf_counter(), 0
-    while done < count:
-        dimension, rows, block = 2 + done // 5000 % 2, 8, min(5000, count - done)
-        normals = rng.normal(size=(block, rows, dimension))
-        normals[:, 1] = np.where(rng.random((block, 1)) < 0.1, -normals[:, 0], normals[:, 1])
-        normals /= np.linalg.norm(normals, axis=2)[..., None]
-        least, wish = rng.uniform(-0.5, 0.15, (block, rows)), rng.normal(size=(block, dimension))
-        found, there = map(np.asarray, compiled(wish, normals, least, np.full(block, 1e3)))
-        for index in range(block):
-            solver = piqp.DenseSolver()
-            settings = solver.settings
-            settings.eps_abs, settings.eps_rel, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = 1e-11, 0.0, 1e-12, 0.0
-            solver.setup(np.eye(dimension), -wish[index], None, None, normals[index], least[index], np.full(rows, 1e30))
-            status = solver.solve()
-            infeasible += status == piqp.PIQP_PRIMAL_INFEASIBLE
-            if (status == piqp.PIQP_PRIMAL_INFEASIBLE) == there[index]:
-                differ += 1
-            elif status == piqp.PIQP_SOLVED:  # else it ran out of digits
-                worst = max(worst, float(np.abs(solver.result.x - found[index]).max()))
-        done += block
-    return (
-        f"{done:,} random problems in 2 and 3 dimensions, {infeasible:,} of them infeasible: the filter and piqp differ on {differ} in whether "
-        f"there is an answer, and elsewhere by at most {worst:.1e} m/s ({time.perf_counter() - begin:.0f} s)."
-    )
-
-
-def said(outcome: Outcome) -> str:
-    when = "never" if outcome.time is None else f"{outcome.time:.2f}"
-    left = f" ({outcome.left} left)" if outcome.left else ""
-    return f"{when}{left} | {outcome.contacts} | {1e3 * outcome.gap:+.3f} | {outcome.path:.2f} | {outcome.step:.2f}"
-
-
-def swaps(counts: list[int], central_up_to: int) -> list[str]:
-    rows = [
-        "| scene | method | time over straight-line time | contacts | smallest gap, mm | path | ms a step |",
-        "|---|---|--:|--:|--:|--:|--:|",
-    ]
-    for count in counts:
-        scene = circle(count)
+def swaps(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    for count in [count for count in (8, 20, 50, 100, 200, 500, 1000) if count <= asked.most]:
         ways = {"consat, points": Consat(Point(RADIUS, SPEED)), "ORCA": orca}
-        if count <= central_up_to:
+        if count <= CENTRAL:
             ways["one QP for all"] = central
         for name, way in ways.items():
-            rows.append(f"| circle of {count} | {name} | {said(way(*scene))} |")
-            print(rows[-1], flush=True)
-        wide = circle(count, 1.6)
-        rows.append(f"| circle of {count}, 1.6 times as wide | consat, unicycles | {said(Consat(Unicycle(RADIUS, SPEED))(*wide))} |")
-        print(rows[-1], flush=True)
-    return rows
+            yield {"scene": f"circle of {count}", "method": name, **asdict(way(*circle(count)))}
+        wide = Consat(Unicycle(RADIUS, SPEED))(*circle(count, 1.6))
+        yield {"scene": f"circle of {count}, 1.6 times as wide", "method": "consat, unicycles", **asdict(wide)}
 
 
-def crowds(counts: list[int], seeds: int) -> tuple[list[str], dict[str, list[Outcome]]]:
-    found: dict[str, list[Outcome]] = {"consat, points": [], "ORCA": []}
-    drive = Consat(Point(RADIUS, SPEED))
-    for count in counts:
-        for seed in range(seeds):
-            scene = scattered(count, seed)
-            found["consat, points"].append(drive(*scene))
-            found["ORCA"].append(orca(*scene))
-        print(count, "robots done", flush=True)
-    rows = [
-        "| method | scenes | all arrived | contacts | smallest gap, mm | time: mean | 95 % | worst | path |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
-    ]
-    for name, outcomes in found.items():
-        times = np.array([outcome.time or np.inf for outcome in outcomes])
-        rows.append(
-            f"| {name} | {len(outcomes)} | {np.isfinite(times).sum()} | {sum(outcome.contacts for outcome in outcomes)} | "
-            f"{1e3 * min(outcome.gap for outcome in outcomes):+.3f} | {times[np.isfinite(times)].mean():.3f} | "
-            f"{np.quantile(times, 0.95, method='lower'):.2f} | {times.max():.2f} | {np.mean([outcome.path for outcome in outcomes]):.3f} |"
+CENTRAL = 50
+"""One QP for all has a row for each pair: up to so many robots."""
+
+
+def swaps_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| scene | method | time over straight-line time | contacts | smallest gap, mm | path | ms a step |"
+    yield "|---|---|--:|--:|--:|--:|--:|"
+    for row in rows:
+        when = "never" if row["time"] is None else f"{row['time']:.2f}"
+        left = f" ({row['left']} left)" if row["left"] else ""
+        yield (
+            f"| {row['scene']} | {row['method']} | {when}{left} | {row['contacts']} | {1e3 * row['gap']:+.3f} | {row['path']:.2f} | {row['step']:.2f} |"
         )
-    ratio = [a.time / b.time for a, b in zip(found["consat, points"], found["ORCA"], strict=True) if a.time and b.time]
-    rows.append("")
-    rows.append(
-        f"consat's time over ORCA's, scene by scene: mean {np.mean(ratio):.3f}, median {np.median(ratio):.3f}, worst {max(ratio):.2f}."
+    yield ""
+    yield from beside([row for row in rows if row["method"] == "consat, points"], [row for row in rows if row["method"] == "ORCA"])
+
+
+def beside(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> Iterator[str]:
+    both = [(a["time"], b["time"]) for a, b in zip(ours, theirs, strict=False) if a["time"] and b["time"]]
+    ratio = np.array([a / b for a, b in both]) if both else np.zeros(0)
+    times = f"mean {ratio.mean():.3f}, median {np.median(ratio):.3f}, worst {ratio.max():.2f}" if both else "none"
+    yield (
+        f"consat's time over ORCA's, on the {len(both)} of {len(ours)} scenes where both arrive: {times}; over 1.2 on {int((ratio > 1.2).sum())}. "
+        f"consat arrives on {sum(row['time'] is not None for row in ours)}, ORCA on {sum(row['time'] is not None for row in theirs)}; "
+        f"contacts: {sum(row['contacts'] for row in ours)} and {sum(row['contacts'] for row in theirs)}."
     )
-    return rows, found
+
+
+CROWDS = (10, 20, 35, 50, 70)
+
+
+def crowds(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    drive = Consat(Point(RADIUS, SPEED))
+    for count in CROWDS:
+        for seed in range(asked.scenes // len(CROWDS)):
+            scene = scattered(count, seed)
+            for method, way in {"consat, points": drive, "ORCA": orca}.items():
+                yield {"robots": count, "seed": seed, "method": method, **asdict(way(*scene))}
+
+
+def crowds_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| method | scenes | all arrived | contacts | smallest gap, mm | time: mean | 95 % | worst | path |"
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+    ways = {name: [row for row in rows if row["method"] == name] for name in ("consat, points", "ORCA")}
+    for name, own in ways.items():
+        times = np.array([np.inf if row["time"] is None else row["time"] for row in own])
+        yield (
+            f"| {name} | {len(own)} | {np.isfinite(times).sum()} | {sum(row['contacts'] for row in own)} | "
+            f"{1e3 * min(row['gap'] for row in own):+.3f} | {times[np.isfinite(times)].mean():.3f} | "
+            f"{np.quantile(times, 0.95, method='lower'):.2f} | {times.max():.2f} | {np.mean([row['path'] for row in own]):.3f} |"
+        )
+    yield ""
+    yield from beside(*ways.values())
 
 
 def shelves() -> list:
@@ -304,64 +295,269 @@ def shelves() -> list:
     return [*boxes, disc([0.3, 0.0], 0.5), disc([-3.0, -0.6], 0.4)]
 
 
-def among(count: int, seeds: int, model) -> tuple[list[Outcome], np.ndarray]:
-    drive = Consat(model, shelves())
-    clear, outcomes = drive._compiled(count, 2, True)[0].map, []
-    for seed in range(seeds):
-        rng = np.random.default_rng(seed)
-        places = []
-        for _ in range(2):
-            points = apart_from(rng, 4 * count, 6.5, 2, 0.5)
-            free = np.asarray(clear.signed_distance(jnp.asarray(points))) > 0.3
-            places.append(points[free][:count])
-        record = [places[0]]
-        outcomes.append(drive(*places, record=record))
-    return outcomes, np.array(record)
+AMONG = 30
 
 
-def among_table(count: int, seeds: int) -> tuple[list[str], np.ndarray]:
-    rows = [
-        "| robots | scenes | all arrived | contacts, with robots or obstacles | smallest gap, mm | clearance, mm | time: mean | worst | ms a step |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
-    ]
+def obstacles(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for name, model in {"points": Point(RADIUS, SPEED), "unicycles": Unicycle(RADIUS, SPEED)}.items():
-        outcomes, record = among(count, seeds, model)
-        times = [outcome.time for outcome in outcomes if outcome.time]
-        rows.append(
-            f"| {count} {name} | {len(outcomes)} | {len(times)} | {sum(each.contacts for each in outcomes)} | {1e3 * min(each.gap for each in outcomes):+.3f} | "
-            f"{1e3 * min(each.clearance for each in outcomes):+.3f} | {np.mean(times):.2f} | {max(times):.2f} | {np.median([each.step for each in outcomes]):.2f} |"
+        drive = Consat(model, shelves())
+        clear = drive._compiled(AMONG, 2, True)[0].map
+        for seed in range(max(2, asked.scenes // 10)):
+            rng, places = np.random.default_rng(seed), []
+            for _ in range(2):
+                points = apart_from(rng, 4 * AMONG, 6.5, 2, 0.5)
+                free = np.asarray(clear.signed_distance(jnp.asarray(points))) > 0.3
+                places.append(points[free][:AMONG])
+            ways = [places[0]]
+            outcome = asdict(drive(*places, record=ways))
+            yield {"robots": f"{AMONG} {name}", **outcome, "ways": np.round(ways, 3).tolist() if seed == 0 else None}
+
+
+def obstacles_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| robots | scenes | all arrived | contacts, with robots or obstacles | smallest gap, mm | clearance, mm | time: mean | worst | ms a step |"
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+    for name in dict.fromkeys(row["robots"] for row in rows):
+        own = [row for row in rows if row["robots"] == name]
+        times = [row["time"] for row in own if row["time"] is not None]
+        yield (
+            f"| {name} | {len(own)} | {len(times)} | {sum(row['contacts'] for row in own)} | {1e3 * min(row['gap'] for row in own):+.3f} | "
+            f"{1e3 * min(row['clearance'] for row in own):+.3f} | {np.mean(times):.2f} | {max(times):.2f} | {np.median([row['step'] for row in own]):.2f} |"
         )
-        print(rows[-1], flush=True)
-    return rows, record
 
 
-def steps(counts: list[int]) -> list[str]:
-    rows = ["| robots | kind | ms a step | contacts |", "|--:|---|--:|--:|"]
-    models = {"points": Point(RADIUS, SPEED), "unicycles": Unicycle(RADIUS, SPEED), "quadrotors, at one height": Quadrotor(RADIUS, SPEED)}
-    for count in counts:
-        for name, model in models.items():
-            scene = scattered(count, 0, scale=1.0 if name == "points" else 1.8)
-            drive, _, chunk = Consat(model)._compiled(count, 2, False)
-            state = drive.model.start(jnp.asarray(scene[0]))
-            carry, spent = (state, drive.start(state)), []
-            for _ in range(4):
-                begin = time.perf_counter()
-                carry = jax.block_until_ready(chunk(*carry, jnp.asarray(scene[1]), None, jnp.zeros(count)))[:2]
-                spent.append(time.perf_counter() - begin)
-            rows.append(f"| {count} | {name} | {1e3 * np.median(spent[1:]) / CHUNK:.2f} | {int(carry[1].report.contacts)} |")
-            print(rows[-1], flush=True)
-    return rows
+def steps(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    plane = {
+        "points": (Point(RADIUS, SPEED), 1.0),
+        "unicycles": (Unicycle(RADIUS, SPEED), 1.8),
+        "double integrators": (Double(RADIUS, SPEED), 1.8),
+        "quadrotors, at one height": (Quadrotor(RADIUS, SPEED), 1.8),
+    }
+    scenes = [(count, 2, name, *how) for count in (100, 1000) for name, how in plane.items() if count <= asked.most]
+    for count, dimension, name, model, scale in [*scenes, (100, 3, "points in space", Point(RADIUS, SPEED), 1.0)]:
+        starts, goals = scattered(count, 0, dimension, scale)
+        drive, _, chunk = Consat(model)._compiled(count, dimension, False)
+        state = drive.model.start(jnp.asarray(starts))
+        carry, spent = (state, drive.start(state)), []
+        for _ in range(12):
+            begin = time.perf_counter()
+            carry = jax.block_until_ready(chunk(*carry, jnp.asarray(goals), None, jnp.zeros(count)))[:2]
+            spent.append(1e3 * (time.perf_counter() - begin) / CHUNK)
+        warm = spent[2:]  # the first two compile
+        yield {
+            "robots": count,
+            "kind": name,
+            "least": min(warm),
+            "median": float(np.median(warm)),
+            "contacts": int(carry[1].report.contacts),
+        }
 
 
-def picture(path: Path, found: dict[str, list[Outcome]], record: np.ndarray) -> None:
+def steps_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| robots | kind | least | median | contacts |"
+    yield "|--:|---|--:|--:|--:|"
+    for row in rows:
+        yield f"| {row['robots']} | {row['kind']} | {row['least']:.2f} | {row['median']:.2f} | {row['contacts']} |"
+
+
+def small(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    begin = time.perf_counter()
+    for row in oracle.compared(asked.problems):
+        yield row._asdict() | {"seconds": time.perf_counter() - begin}
+
+
+def small_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| dimensions | rows | problems | without an answer | piqp undecided | differ | filter wrong | answers apart, m/s | filter farther, m/s | rows violated, m/s |"
+    yield "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
+    for row in rows:
+        counts = " | ".join(f"{row[key]:,}" for key in ("dimension", "rows", "count", "infeasible", "undecided", "differ", "wrong"))
+        yield f"| {counts} | {row['apart']:.1e} | {row['farther']:.1e} | {row['violated']:.1e} |"
+    yield ""
+    yield (
+        f"{sum(row['count'] for row in rows):,} problems in {rows[-1]['seconds']:.0f} s. Where piqp runs out of digits, or they differ, a linear program (HiGHS) says whether there "
+        "is an answer. *Filter farther*: the most that the filter's answer is farther from the wish than piqp's; since it violates no row, it is the better one "
+        "where the two lie apart."
+    )
+
+
+def mujoco(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    for count in (20, 100):
+        result = consat.run(
+            consat.load("drones", [f"count={count}"]), robots="quadrotor", simulator="mujoco", wind=(1.0, 0.5, 0.0), until=30, record=False
+        )
+        yield ran(f"drones, {count} quadrotors in space, wind of 1.1 m/s", result, alone(Quadrotor(), count, 3))
+    yield ran("swap of 8 differential drives", consat.run("swap", simulator="mujoco", until=30), alone(Unicycle(), 8, 2))
+    for name, model in (("differential drives", Unicycle()), ("quadrotors, at one height", Quadrotor())):
+        yield {"scene": f"swap of 8 {name}, without the filter", "duration": 30.0, "contacts": blind(model, circle(8), 30.0)}
+
+
+def ran(scene: str, result: Any, alone: float) -> dict[str, Any]:
+    motion = result.summary["motion"]
+    kept = ("duration", "contacts", "smallest_distance", "satisfied_share_after", "stuck", "unproven")
+    since = result.summary["satisfied_from"]["time"]
+    return {
+        "scene": scene,
+        "since": since,
+        "times": motion["duration"] / result.summary["seconds"]["run"],
+        "alone": alone,
+        **{key: motion[key] for key in kept},
+    }
+
+
+def alone(model: Any, count: int, dimension: int) -> float:
+    """Times real time of the simulator and its controllers, of robots that rest on a grid."""
+    robots = simulated("mujoco", model, count, dimension, [])
+    place = np.stack(np.meshgrid(*[np.arange(10.0)] * dimension), axis=-1).reshape(-1, dimension)[:count]
+    bodies, rest = robots.simulator.start(place), jax.tree.map(np.asarray, robots.reference.start(jnp.asarray(place)))
+    begin = time.perf_counter()
+    for _ in range(40):
+        bodies = robots.simulator.step(bodies, rest, rest, np.zeros_like(place), dt=DT)
+    return 40 * DT / (time.perf_counter() - begin)
+
+
+def blind(model: Any, scene: tuple[np.ndarray, np.ndarray], seconds: float) -> int:
+    """Pairs that touch when everybody heads for its goal without the filter."""
+    count, goals = len(scene[0]), jnp.asarray(scene[1])
+    drive = Drive(simulated("mujoco", model, count, 2, []), count, 2, DT)
+    robots = drive.model
+
+    @jax.jit
+    def step(state: Any, memory: Any) -> Any:
+        way = goals - robots.place(state)
+        length = jnp.linalg.norm(way, axis=1)
+        wish = way * (robots.approach(length, DT) / jnp.maximum(length, 1e-9))[:, None]
+        after = robots.step(state, robots.command(state, wish, DT), DT)
+        return after, drive.observed(after, memory)
+
+    state = robots.start(jnp.asarray(scene[0]))
+    memory = drive.start(state)
+    for _ in range(round(seconds / DT)):
+        state, memory = step(state, memory)
+    return int(memory.report.contacts)
+
+
+def mujoco_told(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| scene | s | all constraints from, s | held after | contacts | smallest gap, m | stuck | times real time | simulator alone |"
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+    for row in rows:
+        if "times" not in row:
+            yield f"| {row['scene']} | {row['duration']:.0f} | – | – | {row['contacts']} | – | – | – | – |"
+            continue
+        since = "never" if row["since"] is None else f"{row['since']:.1f}"
+        held = "–" if row["satisfied_share_after"] is None else f"{100 * row['satisfied_share_after']:.1f} %"
+        yield (
+            f"| {row['scene']} | {row['duration']:.0f} | {since} | {held} | {row['contacts']} | {row['smallest_distance']:.3f} | {len(row['stuck'])} | "
+            f"{row['times']:.1f} | {row['alone']:.1f} |"
+        )
+    told = sorted({sentence for row in rows for sentence in row.get("unproven", [])})
+    yield ""
+    yield f"Conditions of the theorem that did not hold: {'; '.join(told) or 'none'}."
+
+
+Part = tuple[str, str, Callable[[argparse.Namespace], Iterator[dict[str, Any]]], Callable[[list[dict[str, Any]]], Iterator[str]]]
+PARTS: dict[str, Part] = {
+    "swaps": (
+        "Swaps on a circle",
+        (
+            "Everybody goes to the opposite side. Unicycles keep a radius of 0.15 m, the body and the steered point ahead of the axle: their circles are wider. "
+            f"One QP for all has a row for each pair, and takes part up to {CENTRAL} robots."
+        ),
+        swaps,
+        swaps_told,
+    ),
+    "crowds": (
+        "Random crowds",
+        f"{', '.join(map(str, CROWDS[:-1]))} and {CROWDS[-1]} robots, as dense whatever their number.",
+        crowds,
+        crowds_told,
+    ),
+    "obstacles": (
+        "Among obstacles",
+        "Random starts and goals among eight shelves and two pillars; paths are planned, and planned anew, as in `consat run`.",
+        obstacles,
+        obstacles_told,
+    ),
+    "steps": (
+        "Milliseconds a step",
+        (
+            f"Everything that a step does for all robots: neighbours, planes, two small problems a robot, rules, the model's step, the report. {CHUNK} steps at a time, "
+            "from the start of a random crowd, ten times after compilation."
+        ),
+        steps,
+        steps_told,
+    ),
+    "oracle": (
+        "The small problem against piqp",
+        "Random problems of the filter, some without an answer, some with rows that face each other.",
+        small,
+        small_told,
+    ),
+    "mujoco": (
+        "Bodies in MuJoCo",
+        (
+            "`--simulator mujoco`: contacts are MuJoCo's. *Times real time* is of the whole run, protocol and filter included, compilation not; *simulator alone* is of the physics and "
+            "the controllers, of robots at rest. Smallest gaps are between bodies."
+        ),
+        mujoco,
+        mujoco_told,
+    ),
+}
+"""Of each part its heading, what is measured, the measurement, row by row, and its table."""
+
+
+def measured(name: str, asked: argparse.Namespace, kept: Path) -> None:
+    """Measure a part, and keep each row as it comes."""
+    libraries = ("jax", "pyrvo", "piqp", "mujoco-core")
+    begin = time.perf_counter()
+    part = {
+        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "load": round(os.getloadavg()[0], 1),
+        "cores": len(os.sched_getaffinity(0)),
+        "python": platform.python_version(),
+        "versions": {library: version(library) for library in libraries},
+        "consat": consat.__version__,
+        "whole": False,
+        "rows": [],
+    }
+    for row in PARTS[name][2](asked):
+        part["rows"].append(row)
+        part["minutes"] = round((time.perf_counter() - begin) / 60, 1)
+        print({key: value for key, value in row.items() if key != "ways"}, flush=True)
+        keep(kept, name, part)
+    part["whole"] = True
+    keep(kept, name, part)
+
+
+def keep(path: Path, name: str, part: dict[str, Any]) -> None:
+    known = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(known | {name: part}, indent=1) + "\n")
+
+
+def page(parts: dict[str, Any]) -> str:
+    told = [PAGE]
+    for name, (heading, about, _, table) in PARTS.items():
+        if name not in parts or not parts[name]["rows"]:
+            continue
+        part = parts[name]
+        versions = ", ".join(f"{library} {number}" for library, number in part["versions"].items())
+        short = "" if part["whole"] else " (cut short)"
+        when = f"{part['date']}, {part['cores']} cores, load {part['load']} at the start, {part['minutes']:g} minutes; Python {part['python']}, {versions}, consat {part['consat']}"
+        told += [f"## {heading}", about, "\n".join(table(part["rows"]))]
+        if name == "obstacles" and "crowds" in parts:
+            told.append("![consat's times against ORCA's, and ways among shelves](robots.png)")
+        told.append(f"`python benchmarks/robots.py --part {name}`{short}: {when}.")
+    return "\n\n".join(told) + "\n"
+
+
+def picture(path: Path, crowded: list[dict[str, Any]], cluttered: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    ours, theirs = found["consat, points"], found["ORCA"]
-    pairs = np.array([[b.time, a.time] for a, b in zip(ours, theirs, strict=True) if a.time and b.time])
+    ours, theirs = ([row for row in crowded if row["method"] == name] for name in ("consat, points", "ORCA"))
+    both = [(a, b) for a, b in zip(ours, theirs, strict=False) if a["time"] and b["time"]]
+    pairs = np.array([[b["time"], a["time"]] for a, b in both])
     top = pairs.max() * 1.04
     left.plot([0.9, top], [0.9, top], color="0.6", linewidth=1)
     left.plot([0.9, top], [1.08, 1.2 * top], color="0.6", linewidth=1, linestyle="--")
-    touched = np.array([b.contacts > 0 for a, b in zip(ours, theirs, strict=True) if a.time and b.time])
+    touched = np.array([b["contacts"] > 0 for _, b in both])
     left.scatter(*pairs[~touched].T, s=16, color="tab:blue", label="nobody touched")
     left.scatter(*pairs[touched].T, s=16, color="tab:red", label="ORCA's robots touched")
     left.set(xlabel="ORCA", ylabel="consat", xlim=(0.93, top), ylim=(0.93, top), aspect="equal")
@@ -375,94 +571,42 @@ def picture(path: Path, found: dict[str, list[Outcome]], record: np.ndarray) -> 
             right.add_patch(Circle(each.center, each.radius, **style))
         else:
             right.add_patch(Rectangle(each.low, *np.subtract(each.high, each.low), **style))
+    record = np.array(next(row["ways"] for row in reversed(cluttered) if row["ways"]))
     for index in range(record.shape[1]):
         (line,) = right.plot(*record[:, index].T, linewidth=0.8, alpha=0.7)
         right.add_patch(Circle(record[0, index], RADIUS, fill=False, edgecolor=line.get_color()))
         right.add_patch(Circle(record[-1, index], RADIUS, color=line.get_color()))
     right.set(aspect="equal", xlabel="m", ylabel="m")
-    right.set_title("30 unicycles among shelves: starts (rings), ways, ends (discs)", fontsize=10)
+    right.set_title(f"{AMONG} unicycles among shelves, once a second:\nstarts (rings), ways, ends (discs)", fontsize=10)
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer swaps")
-    parser.add_argument("--seeds", type=int, default=20, help="random crowds of each size")
-    parser.add_argument("--oracle", type=int, help="only compare so many small problems with piqp")
-    parser.add_argument("--out", type=Path, help="folder for robots.md and robots.png")
-    arguments = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    if arguments.oracle:
-        print(oracle(arguments.oracle))
-        return
-    begin, seeds = time.perf_counter(), arguments.seeds
-    swapped = swaps([8, 20, 50] if arguments.quick else [8, 20, 50, 100], 20 if arguments.quick else 50)
-    crowded, found = crowds([10, 20, 35, 50, 70], seeds)
-    print(*crowded, sep="\n", flush=True)
-    cluttered, record = among_table(30, max(2, seeds // 2))
-    timed = steps([100, 1000])
-    compared = oracle(10_000)
-    print(compared)
-    if arguments.out:
-        picture(arguments.out / "robots.png", found, record)
-        page = PAGE.format(
-            date=datetime.datetime.now(tz=datetime.UTC).date(),
-            versions=", ".join(f"{name} {version(name)}" for name in ("jax", "pyrvo", "piqp")),
-            python=platform.python_version(),
-            consat=consat.__version__,
-            command=f"python benchmarks/robots.py --seeds {seeds}" + (" --quick" if arguments.quick else ""),
-            minutes=(time.perf_counter() - begin) / 60,
-            swaps="\n".join(swapped),
-            crowds="\n".join(crowded),
-            clutter="\n".join(cluttered),
-            steps="\n".join(timed),
-            oracle=compared,
-        )
-        (arguments.out / "robots.md").write_text(page, encoding="utf-8")
-
-
 PAGE = """# Robots on their way: consat, ORCA and one QP for all
-
-{date}, 2 cores (shared with other work), Python {python}, {versions}, consat {consat}; `{command}`, {minutes:.1f} minutes.
 
 Discs of radius 0.1 m, 0.5 m/s at most, commands every 0.05 s. A robot has arrived within 0.1 m of its goal; the time is that until all have,
 over that which the longest straight way takes. Contacts are pairs that ever overlapped. **consat** is the drive of [robots](../robots.md):
 each robot by itself, from measured positions and velocities. **ORCA** is pyrvo, horizon 2 s, 10 neighbours, a little noise against symmetry
 (ms: `do_step` alone). **One QP for all** is the Robotarium's barrier certificate with its gain (100, cubed), solved by piqp to 1e-2; nobody
-moves when it fails. A path is over the straight line.
+moves when it fails. A path is over the straight line. The numbers are in [robots.json](robots.json)."""
 
-## Swaps on a circle
 
-Everybody goes to the opposite side.
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS), help="what to measure; nothing: only write the page anew")
+    parser.add_argument("--scenes", type=int, default=100, help="random crowds")
+    parser.add_argument("--most", type=int, default=1000, help="robots")
+    parser.add_argument("--problems", type=int, default=1_000_000, help="of the filter, against piqp")
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder for robots.md, robots.png and robots.json")
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    kept = asked.out / "robots.json"
+    for name in asked.part:
+        measured(name, asked, kept)
+    parts = json.loads(kept.read_text())
+    if "crowds" in parts and "obstacles" in parts:
+        picture(asked.out / "robots.png", parts["crowds"]["rows"], parts["obstacles"]["rows"])
+    (asked.out / "robots.md").write_text(page(parts), encoding="utf-8")
 
-{swaps}
-
-Unicycles keep a radius of 0.15 m, the body and the steered point ahead of the axle: their circles are wider.
-
-## Random crowds
-
-10, 20, 35, 50 and 70 robots, as dense whatever their number.
-
-{crowds}
-
-![consat's times against ORCA's, and ways among shelves](robots.png)
-
-## Among obstacles
-
-Random starts and goals among eight shelves and two pillars; paths are planned again every second.
-
-{clutter}
-
-## Milliseconds a step
-
-Everything that a step does for all robots: neighbours, planes, two small problems a robot, rules, the model's step, the report.
-
-{steps}
-
-## The small problem against piqp
-
-{oracle} `python benchmarks/robots.py --oracle 1000000` compares a million.
-"""
 
 if __name__ == "__main__":
     main()

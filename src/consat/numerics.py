@@ -50,6 +50,30 @@ def on_device(value: ArrayLike) -> Array:
     return jax.device_put(np.array(value) if isinstance(value, np.ndarray) else value)
 
 
+def on_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
+    """Call a pure function of NumPy arrays from a compiled program.
+
+    JAX calls it in a thread of its own, which does not know that `float64` holds, and would round; numbers travel as pairs of uint32.
+
+    Args:
+        function: takes trees of float64 and boolean arrays, and returns one.
+        shapes: `jax.ShapeDtypeStruct` of what it returns.
+        arguments: of the function.
+    """
+
+    def packed(array: Any) -> Any:
+        return array if array.dtype == bool else jax.lax.bitcast_convert_type(array, jnp.uint32)
+
+    def called(*packs: Any) -> Any:
+        values = jax.tree.map(lambda pack: np.asarray(pack) if pack.dtype == bool else np.asarray(pack).view(np.float64)[..., 0], packs)
+        found = jax.tree.map(np.ascontiguousarray, function(*values))
+        return jax.tree.map(lambda array: array if array.dtype == bool else array.view(np.uint32).reshape(*array.shape, 2), found)
+
+    travelling = jax.tree.map(lambda each: each if each.dtype == bool else jax.ShapeDtypeStruct((*each.shape, 2), jnp.uint32), shapes)
+    answer = jax.pure_callback(called, travelling, *jax.tree.map(packed, arguments))
+    return jax.tree.map(lambda pack: pack if pack.dtype == bool else jax.lax.bitcast_convert_type(pack, jnp.float64), answer)
+
+
 def once(rows: np.ndarray) -> np.ndarray:
     """(M, …) → (1, …) if all rows are the same memory (stride 0); else the array itself. Equal rows are then processed only once."""
     return rows[:1] if len(rows) > 1 and rows.strides[0] == 0 else rows

@@ -131,7 +131,7 @@ def test_obstacles_without_robots_are_a_fault() -> None:
     team = cs.Team([cs.Agent("a", [cs.within([0, 0], 1)])])
     with pytest.raises(cs.InvalidInput, match="is no robot"):
         cs.run(team, robots=3)
-    with pytest.raises(cs.InvalidSettings, match="wind and noise mean something to robots only"):
+    with pytest.raises(cs.InvalidSettings, match="wind, noise and simulator mean something to robots only"):
         cs.run(team, wind=(1, 0))
     with pytest.raises(cs.InvalidSettings, match="robots have a speed of their own"):
         cs.run(team, robots=cs.Point(), rate=10, speed=1.0)

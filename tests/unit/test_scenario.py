@@ -58,7 +58,7 @@ def best_margin(team: cs.Team) -> float:
 
 # The packaged scenarios.
 
-DRIVEN = ("corridor", "escort", "swap", "warehouse")
+DRIVEN = ("corridor", "drones", "escort", "swap", "warehouse")
 """Those of robots."""
 
 
@@ -73,7 +73,7 @@ def test_packaged_scenario_says_what_it_shows(name: str) -> None:
     assert 2 <= comment <= 4
     scenario = load(name)
     assert (scenario.name, scenario.source, scenario.text) == (name, name, packaged_text(name))
-    assert scenario.team.dimension == 2
+    assert scenario.team.dimension == (3 if name == "drones" else 2)
     assert not disconnected(scenario.team)
     assert (scenario.robots is not None) == (name in DRIVEN)
     assert name in DRIVEN or np.isnan(scenario.team.starts).all()

@@ -23,6 +23,7 @@ LIBRARIES: Final = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "clarabel", "x
 EXTRAS: Final[Mapping[str, Sequence[str]]] = {
     "live": ("starlette", "uvicorn", "websockets"),
     "mcap": ("foxglove-sdk",),
+    "mujoco": ("mujoco-core",),
     "network": ("cryptography", "eclipse-zenoh"),
     "video": ("av",),
 }

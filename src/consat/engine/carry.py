@@ -110,13 +110,14 @@ def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence
         before: ids of the old robots.
         after: ids of the new robots.
     """
-    from consat.robots import Fleet
+    from consat.robots import Fleet, Simulated
 
     report = new.memory.report._replace(
         **{name: getattr(old.memory.report, name) for name in old.memory.report._fields if name != "halted"}
     )
     state = new.state
-    if not isinstance(model, Fleet) and str(jax.tree.structure(old.state)) == str(jax.tree.structure(new.state)):
+    mixed = isinstance(model.reference if isinstance(model, Simulated) else model, Fleet)
+    if not mixed and str(jax.tree.structure(old.state)) == str(jax.tree.structure(new.state)):
         places = _places(before, after)
         state = jax.tree.map(lambda a, b: _merged(a, b, places), old.state, new.state)
     return new._replace(state=state, memory=new.memory._replace(report=report))
@@ -124,12 +125,18 @@ def robots_carried(model: Model[Any], old: Driven, new: Driven, before: Sequence
 
 def robot_placed(model: Model[Any], state: Any, i: int, place: np.ndarray) -> Any:
     """The state of the robots with robot `i` at rest at ``place[i]``. `place`: (N, d) positions."""
-    from consat.robots import Fleet
+    from consat.robots import Fleet, Simulated
 
+    if isinstance(model, Simulated):
+        bodies = _row_taken(state.bodies, model.start(jnp.asarray(place)).bodies, i)
+        return state._replace(reference=robot_placed(model.reference, state.reference, i, place), bodies=bodies)
     if isinstance(model, Fleet):
         kind = int(model.kinds[i])
         rows = model.members[kind]
         own = robot_placed(model.models[kind], state[kind], int(np.searchsorted(rows, i)), place[rows])
         return (*state[:kind], own, *state[kind + 1 :])
-    fresh = model.start(jnp.asarray(place))
+    return _row_taken(state, model.start(jnp.asarray(place)), i)
+
+
+def _row_taken(state: Any, fresh: Any, i: int) -> Any:
     return jax.tree.map(lambda a, b: jnp.asarray(a).at[i].set(jnp.asarray(b)[i]), state, fresh)

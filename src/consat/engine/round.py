@@ -336,7 +336,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         body, robots = _moved(now.body, targets, world.reach), None
     else:
         robots = _driven(world, world.drive, now.robots, targets, jax.random.fold_in(now.key, round_.astype(jnp.int32)))
-        body = world.drive.model.place(robots.state)
+        body = world.drive.position(robots.state)
     heard, word = now.heard, None
     if now.heard is not None and world.owners is not None:
         heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)

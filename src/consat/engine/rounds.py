@@ -29,6 +29,7 @@ from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending, Trace
 from consat.robots.conditions import conditions
 from consat.robots.drive import Drive, Report
+from consat.robots.simulated import Simulated
 
 ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
 """What all must know for a run to end, for each stop rule."""
@@ -408,7 +409,8 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
     """Of ``run --json`` what is said of robots: distances, m, contacts, who is stuck, and which conditions for that nobody
     touches did not hold."""
     if world.drive is None or now.robots is None:
-        return {"smallest_distance": None, "clearance": None, "contacts": 0, "stuck": [], "unproven": []}
+        none = {"smallest_distance": None, "clearance": None, "simulator": None}
+        return none | {"contacts": 0, "collisions": 0, "stuck": [], "unproven": []}
     drive, robots = world.drive, now.robots
     report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
     noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
@@ -417,8 +419,10 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
         "smallest_distance": gap if np.isfinite(gap) else None,
         "clearance": clear if np.isfinite(clear) else None,
         "contacts": int(report.contacts),
+        "collisions": int(report.collisions),
         "stuck": [team.ids[i] for i in np.flatnonzero(stuck).tolist()],
         "unproven": list(conditions(drive, noise=noise, wind=wind, report=report)),
+        "simulator": drive.model.name if isinstance(drive.model, Simulated) else None,
     }
 
 

@@ -24,6 +24,7 @@ from consat.robots.deadlock import Rules
 from consat.robots.model import LARGEST, Model, along, each, squared
 from consat.robots.neighbours import Candidates, Near, candidates, near
 from consat.robots.obstacles import Map, map_of
+from consat.robots.simulated import Simulated
 
 PAIRS_COUNTED = 4000
 """Up to so many robots every pair is remembered that ever touched; of more, touches are counted."""
@@ -243,7 +244,11 @@ class Drive:
 
     def arrived(self, state: Any, targets: Array) -> Array:
         """(N,) who is within `tolerance` of its target."""
-        return jnp.linalg.norm(targets - self.model.place(state), axis=1) < self.arrives
+        return jnp.linalg.norm(targets - self.position(state), axis=1) < self.arrives
+
+    def position(self, state: Any) -> Array:
+        """(N, d) the point that constraints see: the model's place, or where a simulator measures it."""
+        return self.model.position(state) if isinstance(self.model, Simulated) else self.model.place(state)
 
     def _way(self, waypoint: Array, place: Array, targets: Array, paths: Array | None) -> tuple[Array, Array, Array]:
         """The next waypoint (N,), the unit vector to it (N, d), and the length of the way that is left (N,), m.
@@ -277,15 +282,21 @@ class Drive:
         if self.map.count:
             clear = self.map.signed_distance(body) - radius
             overlap = jnp.maximum(overlap, jnp.max(kept - self.map.signed_distance(place)))
-            report = report._replace(
-                clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + jnp.sum(clear < 0.0)
-            )
+            struck = 0 if isinstance(self.model, Simulated) else jnp.sum(clear < 0.0)
+            report = report._replace(clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + struck)
         index = jnp.minimum(around.who, self.count - 1)
         within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
         overlap = jnp.maximum(overlap, jnp.max(jnp.where(around.who < self.count, within, 0.0), initial=0.0))
         report = report._replace(strayed=jnp.maximum(report.strayed, stray), overlap=overlap)
         gap = jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index]
         gap = jnp.where(around.who < self.count, gap, jnp.inf)
+        report = report._replace(smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf)))
+        if isinstance(self.model, Simulated):  # contacts are the simulator's
+            bodies = state.bodies
+            touched = memory.touched | bodies.touching if len(memory.touched) else memory.touched
+            contacts = jnp.sum(touched) if len(memory.touched) else report.contacts + jnp.sum(bodies.touching)
+            report = report._replace(contacts=contacts, collisions=report.collisions + jnp.sum(bodies.struck))
+            return memory._replace(touched=touched, report=report)
         touching = gap < 0.0
         rows = jnp.broadcast_to(jnp.arange(self.count, dtype=index.dtype)[:, None], index.shape)
 
@@ -296,8 +307,7 @@ class Drive:
             return touched, jnp.sum(touched)
 
         touched, contacts = jax.lax.cond(jnp.any(touching), counted, lambda before: before, (memory.touched, report.contacts))
-        smallest = jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf))
-        return memory._replace(touched=touched, report=report._replace(smallest_distance=smallest, contacts=contacts))
+        return memory._replace(touched=touched, report=report._replace(contacts=contacts))
 
 
 @float64

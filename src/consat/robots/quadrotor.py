@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,10 @@ DRAG = 0.3
 """1/s."""
 INNER_STEP = 0.005
 """Of the inner loop, s: 200 Hz."""
+
+
+A = TypeVar("A", Array, np.ndarray)
+"""Arrays of JAX or of NumPy."""
 
 
 class QuadrotorState(NamedTuple):
@@ -136,10 +140,8 @@ class Quadrotor:
         position, velocity, attitude = jax.lax.fori_loop(0, count, one, (state.position, state.velocity, state.attitude))
         return QuadrotorState(position, velocity, attitude, reference)
 
-    def control(
-        self, position: Array, velocity: Array, attitude: Array, target: Array, pace: Array, pull: Array
-    ) -> tuple[Array, Array]:  # what a simulator of rigid bodies needs too
-        """Thrust per mass (N,), m/s², and turn rates (N, 3) in the body's frame, rad/s.
+    def control(self, position: A, velocity: A, attitude: A, target: A, pace: A, pull: A) -> tuple[A, A]:
+        """Thrust per mass (N,), m/s², and turn rates (N, 3) in the body's frame, rad/s; of arrays of JAX or of NumPy.
 
         Args:
             position: (N, 3) of the body.
@@ -149,22 +151,23 @@ class Quadrotor:
             pace: (N, 3) velocity of the reference.
             pull: (N, 3) acceleration of the reference.
         """
+        xp: Any = position.__array_namespace__()
         wanted = pull + DRAG * pace + STIFFNESS * (target - position) + DAMPING * (pace - velocity)
-        lift = jnp.maximum(wanted[:, 2] + GRAVITY, 0.3 * GRAVITY)
-        level = jnp.linalg.norm(wanted[:, :2], axis=1)
-        limit = lift * jnp.tan(each(self.tilt, len(lift)))
-        cut = jnp.where(level > limit, limit / jnp.where(level > 0.0, level, 1.0), 1.0)
-        force = jnp.concatenate([wanted[:, :2] * cut[:, None], lift[:, None]], axis=1)
-        up = force / jnp.linalg.norm(force, axis=1)[:, None]
-        first = jnp.stack([up[:, 2], jnp.zeros_like(lift), -up[:, 0]], axis=1)  # across `up` and the second axis: no yaw
-        first = first / jnp.linalg.norm(first, axis=1)[:, None]
-        goal = jnp.stack([first, jnp.cross(up, first), up], axis=2)
-        error = jnp.swapaxes(goal, 1, 2) @ attitude
-        twist = 0.5 * jnp.stack([error[:, 2, 1] - error[:, 1, 2], error[:, 0, 2] - error[:, 2, 0], error[:, 1, 0] - error[:, 0, 1]], axis=1)
+        lift = xp.maximum(wanted[:, 2] + GRAVITY, 0.3 * GRAVITY)
+        level = xp.linalg.norm(wanted[:, :2], axis=1)
+        limit = lift * np.tan(np.asarray(self.tilt))
+        cut = xp.where(level > limit, limit / xp.where(level > 0.0, level, 1.0), 1.0)
+        force = xp.concatenate([wanted[:, :2] * cut[:, None], lift[:, None]], axis=1)
+        up = force / xp.linalg.norm(force, axis=1)[:, None]
+        first = xp.stack([up[:, 2], xp.zeros_like(lift), -up[:, 0]], axis=1)  # across `up` and the second axis: no yaw
+        first = first / xp.linalg.norm(first, axis=1)[:, None]
+        goal = xp.stack([first, xp.cross(up, first), up], axis=2)
+        error = xp.swapaxes(goal, 1, 2) @ attitude
+        twist = 0.5 * xp.stack([error[:, 2, 1] - error[:, 1, 2], error[:, 0, 2] - error[:, 2, 0], error[:, 1, 0] - error[:, 0, 1]], axis=1)
         rates = -TURNING * twist
-        speed = jnp.linalg.norm(rates, axis=1)
-        rates = rates * jnp.where(speed > TURN_RATE, TURN_RATE / jnp.where(speed > 0.0, speed, 1.0), 1.0)[:, None]
-        return jnp.maximum(jnp.sum(force * attitude[:, :, 2], axis=1), 0.0), rates
+        speed = xp.linalg.norm(rates, axis=1)
+        rates = rates * xp.where(speed > TURN_RATE, TURN_RATE / xp.where(speed > 0.0, speed, 1.0), 1.0)[:, None]
+        return xp.maximum(xp.sum(force * attitude[:, :, 2], axis=1), 0.0), rates
 
     def lowest(self, state: QuadrotorState, command: Array, normals: Array, dt: float) -> Array:
         return self.outer.lowest(state.reference, command, normals, dt)

@@ -64,6 +64,7 @@ class Options:
     robots: Robots | None = None
     wind: tuple[float, ...] = ()
     noise: float = 0.0
+    simulator: str | None = None
     restarts: int = 1
     burst: tuple[float, float] | None = None
 
@@ -96,7 +97,10 @@ class Options:
 
     def require_flow(self, kind: str, team: Team) -> None:
         """Check the options for a continuous-time protocol. Raises: InvalidSettings: an option applies only to rounds."""
-        given = {name: getattr(self, name) for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise")}
+        given = {
+            name: getattr(self, name)
+            for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise", "simulator")
+        }
         given["restarts"] = self.restarts - 1
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
@@ -123,9 +127,11 @@ class Options:
             raise InvalidSettings(f"wind is {list(self.wind)}, but must be {team.dimension} numbers, m/s")
         if not (math.isfinite(self.noise) and self.noise >= 0):
             raise InvalidSettings(f"noise is {self.noise}, but must be a length from 0, m")
-        from consat.robots import Drive
+        from consat.robots import Drive, simulated
 
         model = self.robots.fleet(list(team.ids))
+        if self.simulator is not None:
+            model = simulated(self.simulator, model, team.count, team.dimension, self.robots.obstacles)
         drive = Drive(model, team.count, team.dimension, 1.0 / rate, self.robots.obstacles, noise=self.noise)
         return {"drive": drive, "wind": self.wind, "noise": self.noise}
 
@@ -138,8 +144,8 @@ class Options:
                 "restarts are of agents that are where they want to be; rate, robots and moving constraints mean nothing there"
             )
         rate = RATE if self.rate is None and (team.moves or self.robots is not None) else self.rate
-        if self.robots is None and (self.wind or self.noise):
-            raise InvalidSettings("wind and noise mean something to robots only; give robots, too")
+        if self.robots is None and (self.wind or self.noise or self.simulator):
+            raise InvalidSettings("wind, noise and simulator mean something to robots only; give robots, too")
         if (self.speed is not None and rate is None) or not all(value is None or value > 0 for value in (self.speed, rate)):
             raise InvalidSettings("speed and rate must be positive, and speed needs rate: a body moves at most speed/rate a round")
         body = None if rate is None else Body(rate, np.inf if self.speed is None else self.speed, **self._driven(team, rate))

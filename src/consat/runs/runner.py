@@ -53,6 +53,7 @@ def run(
     obstacles: Sequence[Any] | None = None,
     wind: Sequence[float] = (),
     noise: float = 0.0,
+    simulator: str | None = None,
     auxiliary: float | None = None,
     restarts: int = 1,
     record: bool | None = None,
@@ -90,6 +91,7 @@ def run(
         obstacles: obstacles that robots avoid, as returned by `consat.disc` and similar functions; by default those of the scenario.
         wind: (d,) velocity of the air, m/s, for robots.
         noise: largest error of a robot's measured position, m.
+        simulator: integrates the bodies of robots: ``mujoco``, or, if None, the robots' own models.
         auxiliary: radius, length, of a constraint that is added to every agent: to stay within it of the team's centre (paper, remark 2).
         restarts: number of starts, with `seed` and the seeds after it, which run as one computation. The result is that of the start whose
             run ends with the largest margin. For rounds.
@@ -113,7 +115,7 @@ def run(
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
-        wind=tuple(map(float, wind)), noise=noise, restarts=restarts,
+        wind=tuple(map(float, wind)), noise=noise, simulator=simulator, restarts=restarts,
         burst=None if burst is None else tuple(map(float, burst)),  # type: ignore[arg-type]
     )  # fmt: skip
     if checkpoint is not None and out is None:

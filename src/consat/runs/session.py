@@ -98,6 +98,7 @@ class Session:
         obstacles: obstacles that robots avoid, as in `consat.run`.
         wind: as in `consat.run`.
         noise: as in `consat.run`.
+        simulator: as in `consat.run`.
 
     Raises:
         InvalidTeam: agents that depend on each other are not connected by links (Assumption 1).
@@ -111,12 +112,13 @@ class Session:
         start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
         burst: tuple[float, float] | None = None,
         rate: float | None = None, speed: float | None = None, robots: Any = None, obstacles: Sequence[Any] | None = None,
-        wind: Sequence[float] = (), noise: float = 0.0,
+        wind: Sequence[float] = (), noise: float = 0.0, simulator: str | None = None,
     ) -> None:  # fmt: skip
         scenario = scenario_of(team)
         self._options = Options(
             protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, burst=burst,
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
+            simulator=simulator,
             robots=robots_of(robots, obstacles, scenario),
         )  # fmt: skip
         self._name = scenario.name

@@ -149,6 +149,7 @@ def bodies(summary: Mapping[str, Any]) -> str:
     near = [f"{_number(gap)} m apart at least"] if gap is not None else []
     near += [f"{_number(clear)} m from obstacles"] if clear is not None else []
     told += [", ".join(near)] if near else []
+    told += [f"bodies and contacts by {simulator}"] if (simulator := motion.get("simulator")) else []
     stuck = [_short(agent) for agent in motion["stuck"]]
     more = f", and {len(stuck) - MOST_STUCK} more" if len(stuck) > MOST_STUCK else ""
     return "; ".join([*told, *([f"stuck: {', '.join(stuck[:MOST_STUCK])}{more}"] if stuck else [])])

@@ -1,0 +1,428 @@
+"""Bodies in MuJoCo: quadrotors and differential drives, made of primitive shapes and written as MJCF, among the obstacles of the map.
+
+A quadrotor has four rotors whose thrust is limited, under the geometric controller of `consat.robots.quadrotor`; a differential drive has
+two driven wheels and a caster on a floor with friction, and its steered point follows that of the reference. All have the same drag in the
+air. Contacts are MuJoCo's, between what the models call bodies: the ball of a quadrotor, the disc of a drive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from consat.errors import InvalidSettings
+from consat.robots.double import DoubleState
+from consat.robots.model import Model
+from consat.robots.obstacles import Box, Disc, Polygon
+from consat.robots.quadrotor import DRAG, GRAVITY, Quadrotor
+from consat.robots.simulated import Bodies, kinds_of
+from consat.robots.unicycle import Unicycle, UnicycleState
+
+SOLID = {"contype": 1, "conaffinity": 1}
+"""Bodies and obstacles, which collide with each other."""
+ROLLING = {"contype": 2, "conaffinity": 2}
+"""Wheels, casters and the floor, likewise."""
+SHOWN = {"contype": 0, "conaffinity": 0, "mass": 0}
+"""What is only to be seen."""
+TALL = 10.0
+"""Half the height of obstacles in the plane, m."""
+
+LIFT, INERTIA = 2.0, (0.15, 0.15, 0.27)
+"""Of a quadrotor: the most that its rotors lift, in weights; its inertia, in mass·radius²."""
+ARM, YAW = 0.6, 0.1
+"""In radii: length of its arms, and the moment of a rotor about its axis for its thrust."""
+MIXER = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])
+"""Thrust, and moments about three axes, of rotors at (+, +), (−, +), (−, −) and (+, −); neighbours turn against each other."""
+RATES = 60.0
+"""Of the loop that follows turn rates, 1/s."""
+LEARNING, LEARNT = 15.0, 3.0
+"""Of the integral part that takes up a steady wind, 1/s³, and the most that it comes to, m/s²."""
+
+WHEEL, TRACK, CASTER = 0.35, 0.85, 0.75
+"""Of a drive, in radii: radius of its wheels, half the distance between them, and how far the caster is behind the axle."""
+HIGH, BEHIND = 0.3, 0.2
+"""In radii: how high the middle of its mass is above the floor, and how far behind the axle."""
+SPIN = 0.4
+"""Moment of inertia about the vertical, in mass·radius²."""
+SERVO, GRIP = 0.01, 6.0
+"""Time constant of the wheels' speed loop, s, and the acceleration that their motors are good for, m/s²."""
+FOLLOWING = 8.0
+"""Of the loop that follows the reference, 1/s."""
+MORE = 1.25
+"""How much more than the reference's limits it may ask for."""
+REST, LAG = 0.01, 0.025
+"""Of the tube of a drive: m, and s."""
+
+
+class _Physics(NamedTuple):
+    """What MuJoCo has of N robots; leading axis N, padded with 0.
+
+    Attributes:
+        place: (N, 9) of position, unit quaternion, angles of two wheels.
+        speed: (N, 8) of velocity in the world, turn rate in the body, turn rates of two wheels.
+        warm: (N, 8) the last accelerations, from which contacts are solved.
+        push: (N, 3) of quadrotors the acceleration against the wind, m/s².
+    """
+
+    place: np.ndarray
+    speed: np.ndarray
+    warm: np.ndarray
+    push: np.ndarray
+
+
+class _Now(NamedTuple):
+    """What n robots of a kind know of themselves: see `_Physics`; attitude: (n, 3, 3); mass: (n,), kg; inertia: (n, 3), kg m²."""
+
+    place: np.ndarray
+    speed: np.ndarray
+    attitude: np.ndarray
+    push: np.ndarray
+    mass: np.ndarray
+    inertia: np.ndarray
+
+
+_Control = Callable[[_Now, float, float], tuple[np.ndarray, np.ndarray]]
+"""From what is measured, the time since the step began, and how long motors hold, s, to (n, motors) what they do, and the new push."""
+
+
+class _Design(NamedTuple):
+    """How the robots of a kind are built and controlled.
+
+    Attributes:
+        step: of the physics and of the controller, s, at most.
+        motors: of each robot.
+        joints: of its own, beside the six of a free body.
+        height: of the body's frame above the floor, in radii; 0 of what flies.
+        tube: how far a body may be from its reference, m.
+        body: writes one: into the world, and into the actuators; of its name and radius.
+        control: from two states of the references, dt apart.
+    """
+
+    step: float
+    motors: int
+    joints: int
+    height: float
+    tube: Callable[[Any], Any]
+    body: Callable[[ElementTree.Element, ElementTree.Element, str, float], None]
+    control: Callable[[Any, Any, Any, float], _Control]
+
+
+class _Group(NamedTuple):
+    """Robots of one kind: their model, which rows they are, (n,) their radii, how they are built, and (n, motors) their actuators."""
+
+    kind: Any
+    rows: np.ndarray
+    radius: np.ndarray
+    design: _Design
+    motors: np.ndarray
+
+
+class Simulator:
+    """See `consat.robots.simulated.Simulator`.
+
+    Args:
+        model: of the robots: `Quadrotor`, `Unicycle` or a `Fleet` of both.
+        count: N.
+        dimension: d.
+        obstacles: the public map.
+
+    Attributes:
+        mjcf: the scene, as a document for MuJoCo.
+
+    Raises:
+        InvalidSettings: MuJoCo is not installed, or a kind of robot has no body here.
+    """
+
+    width = sum((9, 8, 8, 3))
+
+    def __init__(self, model: Model[Any], count: int, dimension: int, obstacles: Sequence[Any]) -> None:
+        try:
+            import mujoco
+        except ImportError:
+            raise InvalidSettings("simulator mujoco needs the library mujoco-core; install it with: pip install 'consat[mujoco]'") from None
+        kinds = kinds_of(model, count)
+        if other := [type(kind).__name__.lower() for kind, _ in kinds if type(kind) not in DESIGNS]:
+            raise InvalidSettings(f"simulator mujoco has no body for {other[0]} robots; use unicycle or quadrotor robots")
+        self._mujoco, self._dimension = mujoco, dimension
+        self._groups = [_group(kind, rows) for kind, rows in kinds]
+        self.tube = self._each(lambda group: group.design.tube(group.kind))
+        self.acceleration = self._each(lambda group: GRIP if group.design.joints else np.inf)
+        self._height = self._each(lambda group: group.design.height * group.radius)
+        self.mjcf = _scene(self._groups, dimension, obstacles)
+        self._model = compiled = mujoco.MjModel.from_xml_string(self.mjcf)
+        self._data = mujoco.MjData(compiled)
+        self._bodies = np.array([compiled.body(_name(i)).id for i in range(count)])
+        self._mass, self._inertia = compiled.body_subtreemass[self._bodies], compiled.body_inertia[self._bodies]
+        joints = compiled.body_jntadr[self._bodies]
+        own = self._each(lambda group: group.design.joints).astype(int)
+        self._place = _Slots.of(compiled.jnt_qposadr[joints], 7 + own, 9)
+        self._speed = _Slots.of(compiled.jnt_dofadr[joints], 6 + own, 8)
+        numbers = np.full(compiled.nbody, count)
+        numbers[self._bodies] = np.arange(count)
+        solid = compiled.geom_contype == SOLID["contype"]
+        self._owner = np.where(solid, numbers[compiled.geom_bodyid], -1)  # N of obstacles, −1 of what has no part in contacts
+
+    def start(self, place: np.ndarray) -> Bodies:
+        count = len(place)
+        physics = _Physics(np.zeros((count, 9)), np.zeros((count, 8)), np.zeros((count, 8)), np.zeros((count, 3)))
+        physics.place[:, : self._dimension] = place
+        physics.place[:, 0] -= self._each(lambda group: group.kind.offset if isinstance(group.kind, Unicycle) else 0.0)
+        physics.place[:, 3] = 1.0
+        apart = np.zeros((count, count), dtype=bool)
+        return Bodies(
+            physics.place[:, :3], physics.speed[:, :3], np.zeros(count), np.concatenate(physics, axis=1), apart, apart.any(axis=1)
+        )
+
+    def step(self, bodies: Bodies, before: Any, after: Any, wind: np.ndarray, *, dt: float) -> Bodies:
+        model, data, groups, count = self._model, self._data, self._groups, len(bodies.heading)
+        steps = max(math.ceil(dt / group.design.step - 1e-9) for group in groups)
+        model.opt.timestep = hold = dt / steps
+        place, speed, warm, push = (part.copy() for part in np.split(bodies.inner, [9, 17, 25], axis=1))
+        place[:, 2] += self._height
+        self._place.write(data.qpos, place)
+        self._speed.write(data.qvel, speed)
+        self._speed.write(data.qacc_warmstart, warm)
+        ends = [(before, after)] if len(groups) == 1 else zip(before, after, strict=True)
+        controls = [group.design.control(group.kind, *each, dt) for group, each in zip(groups, ends, strict=True)]
+        air, attitude = _in_space(wind), _matrices(place[:, 3:7])
+        touching, struck = np.zeros((count, count), dtype=bool), np.zeros(count, dtype=bool)
+        for index in range(steps):
+            for group, control in zip(groups, controls, strict=True):
+                now = _Now(*(part[group.rows] for part in (place, speed, attitude, push, self._mass, self._inertia)))
+                data.ctrl[group.motors], push[group.rows] = control(now, hold * index, hold)
+            data.xfrc_applied[self._bodies, :3] = -DRAG * self._mass[:, None] * (speed[:, :3] - air)
+            self._mujoco.mj_step(model, data)
+            place, speed = self._place.read(data.qpos), self._speed.read(data.qvel)
+            attitude = _matrices(place[:, 3:7])
+            if data.ncon:
+                self._look(touching, struck)
+        place[:, 2] -= self._height
+        heading = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
+        physics = _Physics(place, speed, self._speed.read(data.qacc_warmstart), push)
+        return Bodies(place[:, :3], speed[:, :3], heading, np.concatenate(physics, axis=1), touching, struck)
+
+    def _look(self, touching: np.ndarray, struck: np.ndarray) -> None:
+        """Add MuJoCo's contacts between two robots, and between one and an obstacle."""
+        contact = self._data.contact
+        pairs = np.sort(self._owner[contact.geom], axis=1)[contact.dist < 0.0]
+        first, second = pairs[pairs[:, 0] >= 0].T
+        robots = second < len(struck)
+        touching[first[robots], second[robots]] = True
+        struck[first[~robots]] = True
+
+    def _each(self, value: Callable[[_Group], Any]) -> np.ndarray:
+        """(N,) from what is known of each kind."""
+        values = np.zeros(sum(len(group.rows) for group in self._groups))
+        for group in self._groups:
+            values[group.rows] = value(group)
+        return values
+
+
+class _Slots(NamedTuple):
+    """Where the numbers of each robot stand in one of MuJoCo's vectors, and in an array of N rows, padded with 0."""
+
+    row: np.ndarray
+    column: np.ndarray
+    place: np.ndarray
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, first: np.ndarray, own: np.ndarray, width: int) -> _Slots:
+        """Args: first: (N,) where those of each robot begin; own: (N,) how many they are; width: of the rows."""
+        row, column = np.nonzero(np.arange(width)[None] < own[:, None])
+        return cls(row, column, first[row] + column, (len(first), width))
+
+    def write(self, vector: np.ndarray, rows: np.ndarray) -> None:
+        vector[self.place] = rows[self.row, self.column]
+
+    def read(self, vector: np.ndarray) -> np.ndarray:
+        rows = np.zeros(self.shape)
+        rows[self.row, self.column] = vector[self.place]
+        return rows
+
+
+# ---- quadrotors -------------------------------------------------------------------------------------------------------------------------
+
+
+def _flown(kind: Quadrotor, before: DoubleState, after: DoubleState, dt: float) -> _Control:
+    """The thrust of four rotors, N, from thrust and moments as in Lee, Leok, McClamroch, CDC 2010."""
+    begin, old, new = map(_in_space, (before.position, before.velocity, after.velocity))
+    pull = (new - old) / dt
+    levers = np.broadcast_to(kind.radius, len(begin))[:, None] * np.array([ARM, ARM, math.sqrt(2.0) * YAW]) / math.sqrt(2.0)
+
+    def control(now: _Now, time: float, hold: float) -> tuple[np.ndarray, np.ndarray]:
+        target, pace = begin + time * old + 0.5 * time**2 * pull, old + time * pull
+        position, velocity, turning = now.place[:, :3], now.speed[:, :3], now.speed[:, 3:6]
+        push = np.clip(now.push + hold * LEARNING * (target - position), -LEARNT, LEARNT)
+        thrust, rates = kind.control(position, velocity, now.attitude, target, pace, pull + push)
+        moments = now.inertia * RATES * (rates - turning) + np.cross(turning, now.inertia * turning)
+        wanted = np.concatenate([(now.mass * thrust)[:, None], moments / levers], axis=1)
+        return np.clip(0.25 * wanted @ MIXER, 0.0, 0.25 * LIFT * GRAVITY * now.mass[:, None]), push
+
+    return control
+
+
+def _quadrotor(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:
+    """A ball around a hull, four arms and rotors, which are only to be seen."""
+    dark, grey, red = "0.2 0.2 0.25 1", "0.5 0.5 0.55 0.8", "0.8 0.3 0.2 0.8"
+    body = _add(world, "body", name=name)
+    _add(body, "freejoint")
+    _add(body, "inertial", pos=(0, 0, 0), mass=1, diaginertia=radius**2 * np.array(INERTIA))
+    _add(body, "geom", type="sphere", size=radius, rgba="0.3 0.5 0.8 0.15", **SOLID)
+    _add(body, "geom", type="box", size=radius * np.array([0.25, 0.15, 0.1]), rgba=dark, **SHOWN)
+    for motor, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
+        end = ARM * radius / math.sqrt(2.0) * np.array([x, y, 0])
+        _add(body, "geom", type="capsule", fromto=(0, 0, 0, *end), size=0.05 * radius, rgba=dark, **SHOWN)
+        above, shape = end + np.array([0, 0, 0.08 * radius]), radius * np.array([0.35, 0.02])
+        _add(body, "geom", type="cylinder", pos=above, size=shape, rgba=red if x > 0 else grey, **SHOWN)
+        _add(body, "site", name=f"{name} {motor}", pos=end)
+        gear, limits = (0, 0, 1, 0, 0, MIXER[3, motor] * YAW * radius), (0, 0.25 * LIFT * GRAVITY)
+        _add(actuators, "motor", name=f"{name} {motor}", site=f"{name} {motor}", gear=gear, ctrlrange=limits)
+
+
+# ---- differential drives ----------------------------------------------------------------------------------------------------------------
+
+
+def _rolled(kind: Unicycle, before: UnicycleState, after: UnicycleState, dt: float) -> _Control:
+    """The speeds of two wheels, rad/s: the steered point ahead of the axle follows that of the reference."""
+    axle, angle, half = np.asarray(before.axle), np.asarray(before.angle), 0.5 * np.asarray(after.angle - before.angle)
+    chord = np.sum((after.axle - axle) * _ahead(angle + half), axis=1)
+    pace, rate = chord / (dt * np.sinc(half / np.pi)), 2.0 * half / dt
+    top, most, radius, offset = (np.broadcast_to(value, len(angle)) for value in (kind.speed, kind.turn_rate, kind.radius, kind.offset))
+
+    def control(now: _Now, time: float, hold: float) -> tuple[np.ndarray, np.ndarray]:
+        turned = rate * time
+        there, ahead = _ahead(angle + turned), now.attitude[:, :2, 0]
+        middle = axle + (pace * time * np.sinc(0.5 * turned / np.pi))[:, None] * _ahead(angle + 0.5 * turned)
+        error = middle + offset[:, None] * there - now.place[:, :2] - offset[:, None] * ahead
+        wish = pace[:, None] * there + (offset * rate)[:, None] * _across(there) + FOLLOWING * error
+        v, w = np.sum(wish * ahead, axis=1), np.sum(wish * _across(ahead), axis=1) / offset
+        part = np.minimum(1.0, MORE / np.maximum(np.abs(v) / top, np.maximum(np.abs(w) / most, 1e-9)))
+        wheels = (part / (WHEEL * radius))[:, None] * np.stack([v - w * TRACK * radius, v + w * TRACK * radius], axis=1)
+        return wheels, now.push
+
+    return control
+
+
+def _late(kind: Unicycle) -> Any:
+    """How far a drive falls behind its reference, m; measured with random commands. When that halts at once its body comes to stand where
+    its steered point was, which is kept free anyway."""
+    return REST + kind.speed * (LAG + kind.turn_rate * kind.radius * LAG)
+
+
+def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:
+    """A disc with a wheel on either side and a caster behind; its frame is at the middle of the axle."""
+    wheel, ball = WHEEL * radius, 0.15 * radius
+    body = _add(world, "body", name=name)
+    _add(body, "freejoint")
+    middle = (-BEHIND * radius, 0, HIGH * radius - wheel)
+    _add(body, "inertial", pos=middle, mass=1, diaginertia=radius**2 * np.array([0.5, 0.5, 1.0]) * SPIN)
+    _add(body, "geom", type="cylinder", pos=(0, 0, 0.15 * radius), size=(radius, 0.4 * radius), rgba="0.3 0.5 0.8 1", **SOLID)
+    nose, bar = radius * np.array([0.6, 0, 0.56]), radius * np.array([0.25, 0.06, 0.02])
+    _add(body, "geom", type="box", pos=nose, size=bar, rgba="1 1 1 1", **SHOWN)
+    caster = (-CASTER * radius, 0, ball - wheel)
+    _add(body, "geom", type="sphere", pos=caster, size=ball, condim=1, priority=1, mass=0, rgba="0.5 0.5 0.55 1", **ROLLING)
+    for motor, side in enumerate((1, -1)):
+        part = _add(body, "body", pos=(0, side * TRACK * radius, 0))
+        _add(part, "joint", name=f"{name} {motor}", type="hinge", axis=(0, 1, 0), armature=1e-5)
+        shape = {"type": "cylinder", "size": (wheel, 0.08 * radius), "euler": (math.pi / 2, 0, 0)}
+        _add(part, "geom", mass=0.05, friction=(1, 1e-3, 1e-4), rgba="0.15 0.15 0.15 1", **shape, **ROLLING)
+        force, gain = 0.5 * GRIP * wheel, 0.5 * wheel**2 / SERVO
+        _add(actuators, "velocity", name=f"{name} {motor}", joint=f"{name} {motor}", kv=gain, forcerange=(-force, force))
+
+
+DESIGNS: dict[type, _Design] = {
+    Quadrotor: _Design(0.005, 4, 0, 0.0, lambda kind: kind.tube, _quadrotor, _flown),
+    Unicycle: _Design(0.0025, 2, 2, WHEEL, _late, _drive, _rolled),
+}
+"""The kinds of robots that have a body here."""
+
+
+# ---- the scene --------------------------------------------------------------------------------------------------------------------------
+
+
+def _group(kind: Any, rows: np.ndarray) -> _Group:
+    design = DESIGNS[type(kind)]
+    motors = np.zeros((len(rows), design.motors), dtype=int)
+    return _Group(kind, rows, np.broadcast_to(kind.radius, len(rows)), design, motors)
+
+
+def _scene(groups: Sequence[_Group], dimension: int, obstacles: Sequence[Any]) -> str:
+    """MJCF of a team among obstacles; sets which actuators its robots have."""
+    root = ElementTree.Element("mujoco", model="consat")
+    _add(root, "compiler", angle="radian", autolimits="true")
+    option = _add(root, "option", gravity=(0, 0, -GRAVITY), integrator="implicitfast", cone="elliptic", impratio=10)
+    _add(option, "flag", autoreset="disable")
+    asset, world, actuators = _add(root, "asset"), _add(root, "worldbody"), _add(root, "actuator")
+    _add(world, "light", pos=(0, 0, 20), dir=(0, 0, -1))
+    if any(group.design.joints for group in groups):
+        _add(world, "geom", type="plane", size=(0, 0, 1), rgba="0.9 0.9 0.88 1", **ROLLING)
+    for number, obstacle in enumerate(obstacles):
+        for shape in _shapes(obstacle, dimension, number, asset):
+            _add(world, "geom", rgba="0.6 0.6 0.6 1", **shape, **SOLID)
+    written = 0
+    for group in groups:
+        for k, row in enumerate(group.rows.tolist()):
+            group.design.body(world, actuators, _name(row), float(group.radius[k]))
+            group.motors[k] = written + np.arange(group.design.motors)
+            written += group.design.motors
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _shapes(obstacle: Any, dimension: int, number: int, asset: ElementTree.Element) -> Iterator[dict[str, Any]]:
+    """Geoms of an obstacle; those of the plane stand upright."""
+    flat = dimension < 3
+    if isinstance(obstacle, Disc):
+        size = (obstacle.radius, TALL) if flat else obstacle.radius
+        yield {"type": "cylinder" if flat else "sphere", "pos": _in_space(np.array([obstacle.center]))[0], "size": size}
+    elif isinstance(obstacle, Box):
+        low, high = (np.array([*side, end][:3]) for side, end in ((obstacle.low, -TALL), (obstacle.high, TALL)))
+        yield {"type": "box", "pos": 0.5 * (low + high), "size": 0.5 * (high - low)}
+    elif isinstance(obstacle, Polygon):
+        import shapely
+
+        for part, triangle in enumerate(shapely.constrained_delaunay_triangles(shapely.Polygon(obstacle.vertices)).geoms):
+            name, corners = f"obstacle {number} {part}", triangle.exterior.coords[:3]
+            _add(asset, "mesh", name=name, vertex=np.ravel([(x, y, z) for x, y in corners for z in (-TALL, TALL)]))
+            yield {"type": "mesh", "mesh": name}
+
+
+def _name(robot: int) -> str:
+    return f"robot {robot}"
+
+
+def _add(parent: ElementTree.Element, tag: str, /, **attributes: Any) -> ElementTree.Element:
+    """A new element; attributes are text, numbers or vectors."""
+    told = {
+        key: value if isinstance(value, str) else " ".join(f"{float(each):.10g}" for each in np.atleast_1d(value))
+        for key, value in attributes.items()
+    }
+    return ElementTree.SubElement(parent, tag, told)
+
+
+def _in_space(vectors: Any) -> np.ndarray:
+    """(N, d) → (N, 3)."""
+    return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
+
+
+def _ahead(angle: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _across(ahead: np.ndarray) -> np.ndarray:
+    return np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+
+
+def _matrices(quaternions: np.ndarray) -> np.ndarray:
+    """(N, 4) → (N, 3, 3)."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
