@@ -104,7 +104,7 @@ GOALS = (
     *(Goal(Family("random tree", _tree, ()), count, 25) for count in (3, 10, 30)),
     Goal(next(family for family in FAMILIES if family.name == "chain"), 1000, 4),
     *(Goal(Family("ring", _ring, ()), count, None) for count in (60, 200)),
-    *(Goal(Family("random geometric", _geometric, ()), count, None) for count in (50, 200)),
+    Goal(Family("random geometric", _geometric, ()), 50, None),  # 20 seeds of 200 agents at once take more than 6 GB
 )
 TORN = tuple((Family(f"{shape}s", _torn(shape), (), feasible=False), count) for shape in ("tree", "line") for count in (6, 20, 40))
 PACKAGED = tuple((name, count) for name in ("lattice", "swarm") for count in (50, 200, 1000))
@@ -242,7 +242,7 @@ times, with half of the agents asleep or 70 % lost at most 4 times the rounds.
 ## Teams that can
 
 `interior-point`, rounds to satisfaction for good. The goal of teams with loops is half of admm's median, and twice the goal for the 95th percentile.
-From ±1e6 at most 8 rounds more are granted.
+From ±1e6 at most 8 rounds more are granted. Loops of more than 64 agents are left to `admm` by default.
 
 {feasible}
 
