@@ -6,6 +6,7 @@ import importlib.util
 import os
 import shutil
 import time
+from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import consat as cs
+from tests.live.test_widget import Comm, message
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -191,6 +193,55 @@ def test_page_reconnects_when_the_server_is_there_again(browser: Browser) -> Non
         until(tab, "consat.margin > 0.9")
     for _ in pages:
         pass
+
+
+MODEL = """async ([code, page]) => {
+    const { default: widget } = await import(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
+    let heard = null;
+    const model = {
+        get: (name) => ({ page, height: 560 })[name], send: (content) => kernel(content), on: (_, hear) => { heard = hear; }, off() {},
+    };
+    window.hear = (content, buffers) => heard(content, buffers.map((text) => {
+        const bytes = Uint8Array.from(`--------${atob(text)}`, (each) => each.charCodeAt(0));  // a view into more, as notebooks have it
+        return new DataView(bytes.buffer, 8);
+    }));
+    window.close_ = widget.render({ model, el: document.body });
+}"""
+
+
+def test_widget_shows_the_team_and_a_mouse_drags_its_goal(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The notebook is this test: it carries the messages between the widget's two halves."""
+    with cs.live("case-b", widget=True, seed=1) as shown:
+        monkeypatch.setattr(type(shown), "comm", Comm())
+        context = browser.new_context(viewport={"width": 900, "height": 600})
+        tab = context.new_page()
+        tab.expose_function("kernel", lambda content: shown._handle_msg(message(content)))
+        tab.evaluate(MODEL, [shown._esm, shown.page])
+        read = 0
+
+        def until_framed(holds: str) -> Any:
+            nonlocal read
+            end = time.monotonic() + 60.0
+            while time.monotonic() < end:
+                for content, buffers in shown.comm.sent[read:]:
+                    read += 1
+                    tab.evaluate(
+                        "([content, buffers]) => hear(content, buffers)", [content, [b64encode(each).decode() for each in buffers]]
+                    )
+                if found := tab.frames[-1].evaluate(f"window.consat && ({holds})"):
+                    return found
+                tab.wait_for_timeout(20)
+            raise AssertionError(holds)
+
+        before = until_framed("consat.margin > 0.9 && consat.where('a1')")
+        drag(tab, tab.frames[-1].evaluate("consat.handle('a1', 'goal')"), (40, -40))
+        until_framed(f"consat.where('a1')[0] > {before[0] + 20} && consat.where('a1')[1] < {before[1] - 20}")
+        tab.evaluate("close_()")
+        end = time.monotonic() + 10.0
+        while shown._watchers:
+            assert time.monotonic() < end
+            tab.wait_for_timeout(20)
+        context.close()
 
 
 def test_replay_opens_from_disk_with_the_network_off(browser: Browser, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import re
+import sys
 import time
 import urllib.error
 import urllib.request
@@ -12,14 +13,15 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 import consat as cs
-from consat.cli import live as command
+from consat.cli import main
 from consat.errors import InvalidSettings, NetworkError
-from consat.server.app import MOST_CLIENTS, Allowance, Host
+from consat.server import handle
+from consat.server.app import Host
+from consat.server.client import MOST_CLIENTS, Allowance
 from tests.live.conftest import SOCKET, Page, pair
 from tests.live.test_orders import garbled
 
@@ -221,8 +223,14 @@ def test_handle_serves_and_closes() -> None:
         cs.live(pair(), port=-1)
 
 
-def test_command_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
-    found = CliRunner().invoke(command.live, ["case-b"])
-    assert found.exit_code == 2
-    assert "pip install 'consat[live]'" in found.output
+def test_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(handle, "find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["consat", "live", "case-b"])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert "pip install 'consat[live]'" in said
+    assert said.count("\n") == 1
+    with pytest.raises(InvalidSettings, match=r"pip install 'consat\[notebook\]'"):
+        cs.live(pair(), widget=True)

@@ -7,7 +7,7 @@ import { type Ball, FEW, type Frame, type Scene, say } from "./model";
 import { parts, preferDark } from "./page";
 import { createPanel } from "./panel";
 import { createPast } from "./past";
-import { type Answer, connect, type Message, socketAddress } from "./socket";
+import { type Answer, type Carrier, connect, type Message } from "./socket";
 import { THEMES } from "./theme";
 import { createView, type Held } from "./view";
 
@@ -75,7 +75,7 @@ const EMPTY: Scene = {
   hues: [],
 };
 
-export function createLive(root: HTMLElement) {
+export function createLive(root: HTMLElement, carrier: Carrier) {
   const part = parts(root);
   const stage = part<HTMLCanvasElement>("stage");
   const slider = part<HTMLInputElement>("slider");
@@ -109,7 +109,7 @@ export function createLive(root: HTMLElement) {
   view.show.handles = true;
   view.show.messages = true;
 
-  const line = connect(socketAddress(window.location), {
+  const line = connect(carrier, {
     open(on) {
       connected = on;
       dirty = true;

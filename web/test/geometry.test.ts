@@ -3,7 +3,6 @@ import { test } from "node:test";
 import { unpack } from "../src/decode";
 import { between, type Disc, gripOf, hitTest, type Point, placeLabels, scaleOf, shadeOf, type Targets } from "../src/geometry";
 import { createPast } from "../src/past";
-import { socketAddress } from "../src/socket";
 
 const disc = (x: number, y: number, r: number, more: Partial<Disc> = {}): Disc => ({
   x,
@@ -117,7 +116,6 @@ test("who was not there was nowhere", () => {
   assert.deepEqual([...past.at(0)], [3, 4, Number.NaN, Number.NaN]);
 });
 
-test("between, and where the socket is", () => {
+test("between", () => {
   assert.deepEqual([...between(new Float32Array([0, 2]), new Float32Array([1, 4]), 0.5)], [0.5, 3]);
-  assert.equal(socketAddress({ protocol: "https:", host: "a:1", search: "?token=x" }), "wss://a:1/socket?token=x");
 });

@@ -24,6 +24,7 @@ EXTRAS: Final[Mapping[str, Sequence[str]]] = {
     "live": ("starlette", "uvicorn", "websockets"),
     "mcap": ("foxglove-sdk",),
     "network": ("cryptography", "eclipse-zenoh"),
+    "notebook": ("anywidget",),
     "video": ("av",),
 }
 """Of each extra the libraries that it installs."""
