@@ -47,16 +47,9 @@ def measure(count: int, seconds: float = 8.0) -> dict[str, float]:
             tab.wait_for_timeout(100)
         built = time.perf_counter() - begun
         first = tab.evaluate("consat.round")
-        frames = tab.evaluate(
-            """async (seconds) => {
-            const pen = CanvasRenderingContext2D.prototype, drawn = pen.fillRect; let count = 0;
-            pen.fillRect = function (x, y, w, h) { if (x === 0 && y === 0) count += 1; return drawn.call(this, x, y, w, h); };
-            await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
-            pen.fillRect = drawn;
-            return count / seconds;
-        }""",
-            seconds,
-        )
+        drawn = tab.evaluate("consat.drawn")
+        tab.wait_for_timeout(1000 * seconds)
+        frames = (tab.evaluate("consat.drawn") - drawn) / seconds
         rounds = (tab.evaluate("consat.round") - first) / seconds
         goal = f"q{3 * (count // 6)}"
         x, y = tab.evaluate(f"consat.handle('{goal}', 'goal')")

@@ -134,12 +134,10 @@ const BLUES = ["#a7d0e4", "#6bacd1", "#3783bb", "#1b5a9b"];
 
 /** A scale whose steps hold as many agents each: reds for violated, blues for satisfied, which the colour-blind can tell apart. */
 export function scaleOf(margins: ArrayLike<number>): Scale {
-  const finite = Array.from(margins)
-    .filter(Number.isFinite)
-    .sort((a, b) => a - b);
+  const finite = Float32Array.from(margins).filter(Number.isFinite).sort();
   const bad = finite.filter((value) => value <= 0);
   const good = finite.filter((value) => value > 0);
-  const quantile = (values: number[], share: number) => values[Math.min(values.length - 1, Math.floor(share * values.length))];
+  const quantile = (values: Float32Array, share: number) => values[Math.min(values.length - 1, Math.floor(share * values.length))];
   const edges: number[] = [];
   const shades: string[] = [];
   const inner = [0.25, 0.5, 0.75];
@@ -148,6 +146,20 @@ export function scaleOf(margins: ArrayLike<number>): Scale {
   edges.push(...below, 0, ...above);
   shades.push(...REDS.slice(0, below.length + 1), ...BLUES.slice(BLUES.length - above.length - 1));
   return { edges, shades };
+}
+
+/** The places of the least margins, the least first; agents without constraints come last. */
+export function tightest(margins: ArrayLike<number>, most: number): number[] {
+  const found: number[] = [];
+  const key = (i: number) => (Number.isFinite(margins[i]) ? margins[i] : Number.POSITIVE_INFINITY);
+  for (let i = 0; i < margins.length; i += 1) {
+    const mine = key(i);
+    if (found.length === most && mine >= key(found[most - 1])) continue;
+    let k = Math.min(found.length, most - 1);
+    for (; k > 0 && key(found[k - 1]) > mine; k -= 1) found[k] = found[k - 1];
+    found[k] = i;
+  }
+  return found;
 }
 
 export function shadeOf(scale: Scale, margin: number): string {

@@ -2,7 +2,7 @@
 
 import { createChart } from "./chart";
 import { unpack } from "./decode";
-import { between, type Hit, type Point, scaleOf, shadeOf, turned } from "./geometry";
+import { between, type Hit, type Point, scaleOf, shadeOf, tightest, turned } from "./geometry";
 import { type Ball, FEW, type Frame, type Scene, say } from "./model";
 import { parts, preferDark } from "./page";
 import { createPanel } from "./panel";
@@ -100,7 +100,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
   let adding = false;
   let gestures = Date.now();
   const hues = new Map<string, number>();
-  let fps = 0;
+  let between_ = 0;
   let dark = preferDark();
   let dirty = true;
   let drawnAt = 0;
@@ -192,6 +192,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
         if (drag?.begun && drag.held.kind !== "wall" && drag.held.kind !== "agent" && drag.held.k === Number(k)) continue;
         Object.assign(scene.balls[Number(k)], given);
       }
+      view.reshape();
       if (message.walls && !(drag?.begun && drag.held.kind === "wall")) scene.walls = message.walls;
       stale = true;
     },
@@ -325,7 +326,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       where.set(drag.center, drag.held.k * scene.dimension);
     }
     const headings = before?.headings && now.headings ? turned(before.headings, now.headings, share) : now.headings;
-    const history = past.last(past.length - (share < 1 ? 1 : 0), TRAIL);
+    const history = past.last(past.length - (share < 1 || !scene.few ? 1 : 0), TRAIL);
     const step = (before?.round ?? now.round) * (1 - share) + now.round * share;
     return { ...now, where, headings, step, sample: history.length, moment: 0, past: history };
   }
@@ -336,14 +337,15 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     const moving = now && before && time - now.at < 300;
     if (!dirty && !moving) return;
     dirty = false;
-    if (passed > 0 && passed < 1000) fps = fps ? 0.95 * fps + 50 / passed : 1000 / passed;
+    if (passed > 0 && passed < 1000) between_ = between_ ? 0.95 * between_ + 0.05 * passed : passed;
     drawnAt = time;
     const frame = frameNow(time);
     if (frame) {
       gone();
       view.draw(frame);
     }
-    api.fps = fps;
+    api.fps = between_ ? 1000 / between_ : 0;
+    api.drawn += 1;
     if (time - paneledAt > 100) {
       paneledAt = time;
       tell(frame);
@@ -385,11 +387,9 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
 
   function table(frame: Frame): void {
     const rows = part("rows");
-    const order = [...scene.ids.keys()];
     const { margins } = frame;
-    const key = (i: number) => (Number.isFinite(margins[i]) ? margins[i] : Number.POSITIVE_INFINITY);
-    if (!scene.few) order.sort((a, b) => key(a) - key(b));
-    const shown: (number | string)[] = [...order.slice(0, FEW), ...Object.keys(state.silent)];
+    const first = scene.few ? [...scene.ids.keys()] : tightest(margins, FEW);
+    const shown: (number | string)[] = [...first, ...Object.keys(state.silent)];
     while (rows.children.length < shown.length) {
       const row = document.createElement("button");
       row.type = "button";
@@ -402,7 +402,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     }
     while (rows.children.length > shown.length) rows.lastElementChild!.remove();
     const theme = THEMES[dark ? "dark" : "light"];
-    const least = Math.min(...order.slice(0, FEW).map(key));
+    const least = Math.min(...first.map((i) => margins[i]).filter(Number.isFinite));
     shown.forEach((who, k) => {
       const row = rows.children[k] as HTMLElement;
       const [dot, name, tag, told] = [...row.children] as HTMLElement[];
@@ -458,6 +458,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       const center = ball.center.map((value, axis) => value + far * ([dx, dy][axis] ?? 0));
       const order = factor === 1 ? { center } : { radius: ball.radius * factor };
       Object.assign(ball, order);
+      view.reshape();
       order_({ do: "shape", scene: number, shape: k, ...order });
       dirty = true;
     },
@@ -524,6 +525,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       if (!answer.ok) {
         of.order = null;
         if (ball) Object.assign(ball, { center: of.center, radius: of.radius });
+        view.reshape();
         if (drag === of) drag = null;
       } else {
         if (ball && order.scene === number) Object.assign(of, { center: order.center ?? of.center, radius: order.radius ?? of.radius });
@@ -853,6 +855,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     bounds: null as [number | null, number | null] | null,
     reasons: [] as string[],
     fps: 0,
+    drawn: 0,
     latency: Number.NaN,
     agents: () => [...scene.ids],
     /** Where an agent is, in page pixels. */

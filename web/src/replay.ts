@@ -2,7 +2,7 @@
 
 import { createChart } from "./chart";
 import { frameAt, type Recording } from "./decode";
-import { shadeOf } from "./geometry";
+import { shadeOf, tightest } from "./geometry";
 import { FEW, type Frame, say } from "./model";
 import { parts, preferDark } from "./page";
 import { THEMES } from "./theme";
@@ -44,11 +44,8 @@ export function createPlayer(root: HTMLElement, run: Recording) {
   };
 
   function table(frame: Frame): void {
-    const order = [...run.ids.keys()];
     const rows = part("rows");
-    const key = (i: number) => (Number.isFinite(frame.margins[i]) ? frame.margins[i] : Number.POSITIVE_INFINITY);
-    if (!run.few) order.sort((a, b) => key(a) - key(b));
-    const shown = order.slice(0, FEW);
+    const shown = run.few ? [...run.ids.keys()] : tightest(frame.margins, FEW);
     while (rows.children.length < shown.length) {
       const row = document.createElement("button");
       row.type = "button";

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { unpack } from "../src/decode";
-import { between, type Disc, gripOf, hitTest, type Point, placeLabels, scaleOf, shadeOf, type Targets } from "../src/geometry";
+import { between, type Disc, gripOf, hitTest, type Point, placeLabels, scaleOf, shadeOf, type Targets, tightest } from "../src/geometry";
 import { createPast } from "../src/past";
 
 const disc = (x: number, y: number, r: number, more: Partial<Disc> = {}): Disc => ({
@@ -114,6 +114,13 @@ test("who was not there was nowhere", () => {
   past.add(0, 0, new Float32Array([1, 2, 3, 4]));
   past.follow(["a", "b"], ["b", "c"], 2);
   assert.deepEqual([...past.at(0)], [3, 4, Number.NaN, Number.NaN]);
+});
+
+test("the tightest are those that a sort would put first", () => {
+  const margins = Array.from({ length: 500 }, (_, i) => (i % 50 === 7 ? Number.POSITIVE_INFINITY : Math.sin(7 * i)));
+  const sorted = [...margins.keys()].sort((a, b) => margins[a] - margins[b]);
+  assert.deepEqual(tightest(margins, 12), sorted.slice(0, 12));
+  assert.deepEqual(tightest([Number.NaN, 2, 1], 12), [2, 1, 0]);
 });
 
 test("between", () => {
