@@ -573,6 +573,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       if (held.kind === "agent") grabbed = Array.from(now!.where.subarray(held.k * scene.dimension, (held.k + 1) * scene.dimension));
       else grabbed = held.kind === "grip" ? [...scene.balls[held.k].center] : [];
       part("hint").hidden = true;
+      tip.hidden = true;
     }
     const round = (values: number[]) => values.map((value) => Number(value.toPrecision(7)));
     const { held } = of;

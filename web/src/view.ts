@@ -390,7 +390,8 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         pen.moveTo(a[0], a[1]);
         pen.lineTo(b[0], b[1]);
         const text = String(Number(value.toPrecision(6))).replace("-", "−");
-        if (!scene.space && (axis ? a[1] < height - 22 : a[0] > 4)) labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
+        if (!scene.space && (axis ? a[1] > 16 && a[1] < height - 22 : a[0] > 4))
+          labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
       }
     }
     pen.stroke();
