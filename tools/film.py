@@ -46,6 +46,7 @@ def picture(tab: Page, at: tuple[float, float], *, pressed: bool) -> Image.Image
 
 
 def until(tab: Page, holds: str) -> None:
+    """Wait for it."""
     while not tab.evaluate(holds):
         tab.wait_for_timeout(50)
 
@@ -91,6 +92,7 @@ def save(pictures: list[Image.Image], path: Path) -> None:
 
 
 def main() -> None:
+    """Make the film."""
     from playwright.sync_api import sync_playwright
 
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "figures" / "live.gif"

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import shutil
 import time
 from base64 import b64encode
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from PIL import Image
 
 import consat as cs
 from tests.live.test_widget import Comm, message
@@ -171,13 +173,85 @@ def test_touch_drags_too(browser: Browser, live: Any) -> None:
         tab.evaluate("consat.send({do: 'undo'})")
 
 
+def choose(tab: Tab, agent: str) -> None:
+    """By its row in the list, which stays where it is, unlike the agent."""
+    row = tab.locator("[data-part=rows] button", has=tab.get_by_text(agent, exact=True))
+    row.focus()
+    tab.keyboard.press("Enter")
+    tab.get_by_role("heading", name=f"agent {agent}").wait_for()
+
+
 def test_every_control_has_a_name(tab: Tab) -> None:
-    tab.mouse.click(*tab.evaluate("consat.where('a2')"))
-    tab.locator("[data-part=panel]").wait_for()
+    choose(tab, "a2")
     nameless = tab.evaluate("""[...document.querySelectorAll('button, input, select, canvas')]
         .filter((each) => !each.getAttribute('aria-label') && !(each.closest('label') ?? each).textContent.trim())
         .map((each) => each.outerHTML)""")
     assert nameless == []
+    names = [each.get_attribute("aria-label") for each in tab.locator("[data-part=panel] button").all()]
+    assert len(set(names)) == len(names)
+
+
+def test_keyboard_does_what_a_mouse_does(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9")
+    choose(tab, "a1")
+    before = goal_of(tab, "a1")
+    tab.get_by_role("button", name="goal of a1: arrow keys").focus()
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("+")
+    until(tab, "consat.margin > 0 && consat.verdict == 'feasible'")
+    after = goal_of(tab, "a1")
+    assert after["center"][0] > before["center"][0]
+    assert after["radius"] == pytest.approx(1.1 * before["radius"])
+    for _ in range(2):
+        tab.keyboard.press("z")
+    until(tab, "consat.margin > 0.9")
+    assert goal_of(tab, "a1") == before
+    tab.keyboard.press("k")
+    tab.get_by_label("Play", exact=True).focus()  # else the arrow moves the region
+    round_ = tab.evaluate("consat.round")
+    tab.keyboard.press("ArrowRight")
+    until(tab, f"consat.round == {round_ + 1}")
+    tab.keyboard.press("k")
+    tab.keyboard.press("Delete")
+    until(tab, "consat.agents().join() == 'a2,a3'")
+    tab.keyboard.press("z")
+    until(tab, "consat.agents().join() == 'a1,a2,a3' && consat.margin > 0.9")
+
+
+def goal_of(tab: Tab, agent: str) -> dict[str, Any]:
+    team = cs.loads(tab.evaluate("consat.send({do: 'text'})")["text"]).team
+    parameters = next(each for each in team.agents if each.id == agent).constraints[0].parameters
+    return {"center": list(parameters["center"].value), "radius": float(parameters["radius"].value)}
+
+
+def test_goal_of_a_crowd_is_drawn_where_it_is(browser: Browser) -> None:
+    """What stands still in a crowd is drawn once; what changed must be drawn anew."""
+    agents = [cs.Agent(f"q{i}", [cs.within([4 * (i % 5), 4 * (i // 5)], 1, name="goal")], [4 * (i % 5), 4 * (i // 5)]) for i in range(15)]
+    with cs.live(cs.Team(agents, [(f"q{i}", f"q{i + 1}") for i in range(14)]), seed=1, port=0, open_page=False, block=False) as live:
+        for tab in opened(browser, live.url):
+            for name in ("paths", "links"):
+                tab.get_by_label(name).uncheck()
+            until(tab, "consat.margin > 0.9")
+            x, y = tab.evaluate("consat.where('q7')")
+
+            def tinted(dx: float, tab: Tab = tab, x: float = x, y: float = y) -> bool:
+                """Whether the ground is, below the agent and in its goal."""
+                shot = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
+                return shot.getpixel((x + dx + 5, y + 25)) != (255, 255, 255)
+
+            assert [tinted(0), tinted(60)] == [True, False]
+            drag(tab, tab.evaluate("consat.handle('q7', 'goal')"), (60, 0))
+            tab.mouse.move(10, 300)
+            settle(lambda: [tinted(0), tinted(60)] == [False, True])
+            tab.keyboard.press("z")
+            settle(lambda: [tinted(0), tinted(60)] == [True, False])
+
+
+def settle(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.1)
 
 
 def test_page_reconnects_when_the_server_is_there_again(browser: Browser) -> None:

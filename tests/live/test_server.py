@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import random
 import re
+import socket
 import sys
 import time
+import tracemalloc
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
@@ -221,6 +223,38 @@ def test_handle_serves_and_closes() -> None:
         urllib.request.urlopen(page.url)  # noqa: S310
     with pytest.raises(InvalidSettings, match="port is -1"):
         cs.live(pair(), port=-1)
+
+
+def test_client_that_reads_nothing_slows_nobody_and_nothing_is_kept_for_it() -> None:
+    with (
+        cs.live(pair(), port=0, open_page=False, block=False, seed=1) as live,
+        socket.create_connection(("127.0.0.1", int(live.url.split(":")[2].strip("/")))) as deaf,
+    ):
+        deaf.sendall(
+            b"GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        simulation = live._simulation
+        end = time.monotonic() + 60.0
+        while simulation._session.round < 5:  # it watches, so the team goes on
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        tracemalloc.start()
+        before, longest = simulation._session.round, 0.0
+        for _ in range(2000):  # 400 MB
+            begun = time.monotonic()
+            simulation.board.put("frame", bytes(200_000))
+            simulation.notify()
+            longest = max(longest, time.monotonic() - begun)
+            time.sleep(0.001)
+        kept, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert kept < 20_000_000
+        assert longest < 1.0
+        end = time.monotonic() + 60.0
+        while simulation._session.round < before + 20:
+            assert time.monotonic() < end
+            time.sleep(0.05)
 
 
 def test_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -99,24 +99,26 @@ const overlap = (a: Box, b: Box): boolean => a[0] < b[2] && b[0] < a[2] && a[1] 
 
 /**
  * Where names stand: for each point the offset of its text's left end of the baseline, so that it meets the fewest others.
- * `widths` in px; texts are 12 px high. Points that shall have no name have width 0.
+ * `widths` in px; texts are 12 px high. Points that shall have no name have width 0; all are
+ * drawn with radius `size`.
  */
 export function placeLabels(points: ArrayLike<Point>, widths: number[], [width, height]: Point, size = 7): Point[] {
   const taken: Box[] = Array.from(points, ([x, y]) => [x - size, y - size, x + size, y + size]);
   return Array.from(points, ([x, y], i) => {
     const wide = widths[i];
     if (wide === 0) return [0, 0];
+    const off = 0.7 * size + 4;
     const spots: Point[] = [
-      [9, -9],
-      [-9 - wide, -9],
-      [9, 19],
-      [-9 - wide, 19],
-      [-wide / 2, -13],
-      [-wide / 2, 23],
-      [14, 4],
-      [-14 - wide, 4],
-      [12, -24],
-      [12, 32],
+      [off, -off],
+      [-off - wide, -off],
+      [off, off + 10],
+      [-off - wide, off + 10],
+      [-wide / 2, -size - 6],
+      [-wide / 2, size + 16],
+      [size + 7, 4],
+      [-size - 7 - wide, 4],
+      [size + 5, -size - 17],
+      [size + 5, size + 25],
     ];
     const boxes = spots.map(([u, v]): Box => [x + u, y + v - 12, x + u + wide, y + v + 3]);
     const meets = boxes.map(

@@ -811,7 +811,6 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     if (on instanceof HTMLSelectElement || on instanceof HTMLTextAreaElement || event.altKey) return;
     if (on instanceof HTMLInputElement && on.type !== "checkbox") return;
     if ((event.ctrlKey || event.metaKey) && event.key !== "z") return;
-    if (on instanceof HTMLElement && on.classList.contains("knob") && event.key !== "z") return;
     const keys: Record<string, () => void> = {
       " ": play,
       k: play,

@@ -633,21 +633,22 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       ring(chosen, 7);
       pen.stroke();
     }
-    drawNames(chosen);
+    drawNames(frame, chosen);
   }
 
-  function drawNames(chosen: number): void {
+  function drawNames(frame: Frame, chosen: number): void {
     pen.font = "600 13px system-ui, sans-serif";
     pen.lineJoin = "round";
     const who = show.names && scene.few ? [...scene.ids.keys()] : chosen >= 0 ? [chosen] : [];
     if (!who.length) return;
     const texts = who.map((i) => (scene.ids[i].length > 16 ? `${scene.ids[i].slice(0, 15)}…` : scene.ids[i]));
-    const at = who.map((i) => places[i]);
+    const bodies = scene.bodies && who.map((i) => bodyOf(frame, i));
+    const at = bodies ? bodies.map(({ middle }) => middle) : who.map((i) => places[i]);
     const offsets = placeLabels(
       at,
       texts.map((text) => pen.measureText(text).width),
       [width, height],
-      Math.max(7, scale * Math.max(0, ...who.map((i) => scene.bodies?.radius[i] ?? 0))),
+      Math.max(7, ...(bodies ?? []).map(({ r }) => r + 4)),
     );
     texts.forEach((text, k) => {
       const [px, py] = [at[k][0] + offsets[k][0], at[k][1] + offsets[k][1]];
