@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
-import os
-import shutil
 import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator
@@ -16,19 +13,14 @@ import pytest
 from PIL import Image
 
 import consat as cs
+from tests.browser import BROWSER, needs_browser
 from tests.live.test_widget import Comm, message
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
     from playwright.sync_api import Page as Tab
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-MISSING = "there is no Chromium; on Debian: apt-get install chromium" if BROWSER is None else ""
-if not MISSING and importlib.util.find_spec("playwright") is None:
-    MISSING = "there is no playwright; pip install playwright"
-if MISSING and os.environ.get("CONSAT_BROWSER") == "required":  # as in .ci/run
-    pytest.fail(MISSING, pytrace=False)
-pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
