@@ -1,4 +1,4 @@
-"""The browser that the tests of pages drive. Where it is missing they are skipped; with CONSAT_BROWSER=required they fail, as in .ci/run."""
+"""The browser that tests of pages drive. Where it is missing they are skipped; with CONSAT_BROWSER=required, as in .ci/run, they fail."""
 
 import importlib.util
 import os
