@@ -280,7 +280,7 @@ def test_widget_shows_the_team_and_a_mouse_drags_its_goal(browser: Browser, monk
     """The notebook is this test: it carries the messages between the widget's two halves."""
     with cs.live("case-b", widget=True, seed=1) as shown:
         monkeypatch.setattr(type(shown), "comm", Comm())
-        context = browser.new_context(viewport={"width": 900, "height": 600})
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
         tab = context.new_page()
         tab.expose_function("kernel", lambda content: shown._handle_msg(message(content)))
         tab.evaluate(MODEL, [shown._esm, shown.page])
@@ -300,7 +300,7 @@ def test_widget_shows_the_team_and_a_mouse_drags_its_goal(browser: Browser, monk
                 tab.wait_for_timeout(20)
             raise AssertionError(holds)
 
-        before = until_framed("consat.margin > 0.9 && consat.where('a1')")
+        before = until_framed("consat.margin > 0.95 && consat.where('a1')")
         box = tab.locator("iframe").bounding_box()
         x, y = tab.frames[-1].evaluate("consat.handle('a1', 'goal')")
         drag(tab, [box["x"] + x, box["y"] + y], (40, -40))

@@ -62,7 +62,7 @@ class View:
                     told = json.loads(text)
                     self.newest[told["type"]] = told
             assert not left
-            self.send(taken=True)
+            self.send(taken=1)
 
     def until(self, holds: Callable[[dict[str, Any]], bool], seconds: float = 60.0) -> None:
         end = time.monotonic() + seconds

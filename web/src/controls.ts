@@ -106,7 +106,9 @@ export function tellAt(tip: HTMLElement, stage: HTMLElement, text: string, [x, y
 
 /** Where an agent is, and its margin, in words. */
 export function agentInWords(scene: Scene, i: number, where: Float32Array, margin: number): string {
-  const at = [...where.subarray(i * scene.dimension, (i + 1) * scene.dimension)].map((value) => say(value));
+  const nothing = 1e-6 * Math.max(...scene.high.map((high, axis) => high - scene.low[axis]));
+  const own = [...where.subarray(i * scene.dimension, (i + 1) * scene.dimension)];
+  const at = own.map((value) => say(Math.abs(value) < nothing ? 0 : value));
   return `${scene.ids[i]} at (${at.join(", ")})${scene.unit ? ` ${scene.unit}` : ""}, margin ${say(margin)}`;
 }
 

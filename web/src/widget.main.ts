@@ -1,5 +1,8 @@
 // The view in a notebook, an anywidget: the live page in a frame of its own, so that neither sees the other's styles and keys.
-// Messages go from the kernel's comm to the frame's port and back. Every message is confirmed, since a comm keeps all that it is given.
+// Messages go from the kernel's comm to the frame's port and back. They are confirmed, since a comm keeps all that it is given; with the
+// next order, or some at a time, since each request makes a notebook show that its kernel is busy.
+
+const PATIENCE = 100;
 
 interface Told {
   view: string;
@@ -18,6 +21,14 @@ interface Model {
 function render({ model, el }: { model: Model; el: HTMLElement }): () => void {
   const view = `${Date.now()}-${Math.random()}`;
   let near: MessagePort | null = null;
+  let taken = 0;
+  let later = 0;
+  const send = (content: Record<string, unknown>): void => {
+    clearTimeout(later);
+    later = 0;
+    model.send({ view, taken, ...content });
+    taken = 0;
+  };
   const frame = document.createElement("iframe");
   frame.title = "consat: the team, live";
   frame.allow = "clipboard-write";
@@ -34,7 +45,8 @@ function render({ model, el }: { model: Model; el: HTMLElement }): () => void {
         k += 1;
       }
     }
-    model.send({ view, taken: true });
+    taken += 1;
+    later ||= window.setTimeout(send, PATIENCE, {});
   };
   model.on("msg:custom", hear);
   // Again, where the notebook moves the cell: a frame that is moved begins anew.
@@ -42,14 +54,15 @@ function render({ model, el }: { model: Model; el: HTMLElement }): () => void {
     near?.close();
     const { port1, port2 } = new MessageChannel();
     near = port1;
-    near.onmessage = ({ data }) => model.send({ view, order: data });
+    near.onmessage = ({ data }) => send({ order: data });
     frame.contentWindow?.postMessage("consat", "*", [port2]);
-    model.send({ view, opened: true });
+    taken = 0;
+    send({ opened: true });
   });
   el.append(frame);
   return () => {
     model.off("msg:custom", hear);
-    model.send({ view, closed: true });
+    send({ closed: true });
     near?.close();
   };
 }

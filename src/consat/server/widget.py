@@ -14,7 +14,7 @@ from consat.server.client import MOST_CLIENTS, Client
 from consat.server.page import page
 from consat.server.simulation import Simulation
 
-MOST_UNTAKEN: Final = 2
+MOST_UNTAKEN: Final = 8
 """Messages on their way to a view; a comm has no limit of its own, and would keep all of a slow one's."""
 PATIENCE: Final = 10.0
 """Seconds after which a view that takes nothing is taken to be gone. If it was only slow it is told everything anew."""
@@ -34,8 +34,8 @@ class Watcher(Client):
 class LiveWidget(anywidget.AnyWidget):
     """A team that lives in a notebook.
 
-    Each view has a name. It sends ``{view, opened}``, ``{view, taken}`` for a message that it took, ``{view, order}`` with the order as
-    text, and ``{view, closed}``. It is sent ``{view, texts}``, of which those that are null stand for the buffers, in order.
+    Each view has a name. It sends ``{view, taken}``, how many messages it took since, to which it adds ``opened``, ``closed``, or
+    ``order``, the order as text. It is sent ``{view, texts}``, of which those that are null stand for the buffers, in order.
 
     Args:
         simulation: the team; it is started.
@@ -87,8 +87,9 @@ class LiveWidget(anywidget.AnyWidget):
             watcher = self._watchers.get(view) or self._open(view)
             if watcher is None:
                 return
-            if "taken" in content:
-                watcher.untaken, watcher.since = max(0, watcher.untaken - 1), time.monotonic()
+            taken = content.get("taken")
+            if isinstance(taken, int) and taken > 0:
+                watcher.untaken, watcher.since = max(0, watcher.untaken - taken), time.monotonic()
             if isinstance(content.get("order"), str):
                 watcher.take(content["order"])
         self._tell()
