@@ -10,7 +10,7 @@ if (process.argv.includes("--tests")) {
   const entries = (await readdir(`${here}test`)).filter((name) => name.endsWith(".test.ts")).map((name) => `${here}test/${name}`);
   await build({ entryPoints: entries, bundle: true, platform: "node", format: "esm", outdir: `${here}.test`, outExtension: { ".js": ".mjs" } });
 } else {
-  for (const name of ["replay", "live"]) {
+  for (const name of ["replay", "live", "widget"]) {
     const target = `${here}../src/consat/views/${name}.js`;
     const built = await build({
       entryPoints: [`${here}src/${name}.main.ts`], bundle: true, format: name === "replay" ? "iife" : "esm", target: "es2022", minify: true, charset: "utf8", write: false,

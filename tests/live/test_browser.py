@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import shutil
+import io
 import time
-from collections.abc import Iterator
+from base64 import b64encode
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from PIL import Image
 
 import consat as cs
+from tests.browser import BROWSER, needs_browser
+from tests.live.test_widget import Comm, message
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
     from playwright.sync_api import Page as Tab
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-MISSING = "there is no Chromium; on Debian: apt-get install chromium" if BROWSER is None else ""
-if not MISSING and importlib.util.find_spec("playwright") is None:
-    MISSING = "there is no playwright; pip install playwright"
-if MISSING and os.environ.get("CONSAT_BROWSER_REQUIRED"):
-    pytest.fail(MISSING, pytrace=False)
-pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +146,8 @@ def test_two_browsers_see_the_same(browser: Browser, tab: Tab, live: Any) -> Non
         tab.get_by_label("Pause").click()
         other.get_by_label("Play", exact=True).wait_for()
         until(other, f"consat.round == {tab.evaluate('consat.round')}")
-        assert other.evaluate("consat.where('a1')") == pytest.approx(tab.evaluate("consat.where('a1')"), abs=0.01)
+        # Each glides to where the team is.
+        settle(lambda other=other: other.evaluate("consat.where('a1')") == pytest.approx(tab.evaluate("consat.where('a1')"), abs=0.01))
         other.keyboard.press(" ")
         tab.get_by_label("Pause").wait_for()
 
@@ -169,13 +166,85 @@ def test_touch_drags_too(browser: Browser, live: Any) -> None:
         tab.evaluate("consat.send({do: 'undo'})")
 
 
+def choose(tab: Tab, agent: str) -> None:
+    """By its row in the list, which stays where it is, unlike the agent."""
+    row = tab.locator("[data-part=rows] button", has=tab.get_by_text(agent, exact=True))
+    row.focus()
+    tab.keyboard.press("Enter")
+    tab.get_by_role("heading", name=f"agent {agent}").wait_for()
+
+
 def test_every_control_has_a_name(tab: Tab) -> None:
-    tab.mouse.click(*tab.evaluate("consat.where('a2')"))
-    tab.locator("[data-part=panel]").wait_for()
+    choose(tab, "a2")
     nameless = tab.evaluate("""[...document.querySelectorAll('button, input, select, canvas')]
         .filter((each) => !each.getAttribute('aria-label') && !(each.closest('label') ?? each).textContent.trim())
         .map((each) => each.outerHTML)""")
     assert nameless == []
+    names = [each.get_attribute("aria-label") for each in tab.locator("[data-part=panel] button").all()]
+    assert len(set(names)) == len(names)
+
+
+def test_keyboard_does_what_a_mouse_does(tab: Tab) -> None:
+    until(tab, "consat.margin > 0.9")
+    choose(tab, "a1")
+    before = goal_of(tab, "a1")
+    tab.get_by_role("button", name="goal of a1: arrow keys").focus()
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("+")
+    until(tab, "consat.margin > 0 && consat.verdict == 'feasible'")
+    after = goal_of(tab, "a1")
+    assert after["center"][0] > before["center"][0]
+    assert after["radius"] == pytest.approx(1.1 * before["radius"])
+    for _ in range(2):
+        tab.keyboard.press("z")
+    until(tab, "consat.margin > 0.9")
+    assert goal_of(tab, "a1") == before
+    tab.keyboard.press("k")
+    tab.get_by_label("Play", exact=True).focus()  # else the arrow moves the region
+    round_ = tab.evaluate("consat.round")
+    tab.keyboard.press("ArrowRight")
+    until(tab, f"consat.round == {round_ + 1}")
+    tab.keyboard.press("k")
+    tab.keyboard.press("Delete")
+    until(tab, "consat.agents().join() == 'a2,a3'")
+    tab.keyboard.press("z")
+    until(tab, "consat.agents().join() == 'a1,a2,a3' && consat.margin > 0.9")
+
+
+def goal_of(tab: Tab, agent: str) -> dict[str, Any]:
+    team = cs.loads(tab.evaluate("consat.send({do: 'text'})")["text"]).team
+    parameters = next(each for each in team.agents if each.id == agent).constraints[0].parameters
+    return {"center": list(parameters["center"].value), "radius": float(parameters["radius"].value)}
+
+
+def test_goal_of_a_crowd_is_drawn_where_it_is(browser: Browser) -> None:
+    """What stands still in a crowd is drawn once; what changed must be drawn anew."""
+    agents = [cs.Agent(f"q{i}", [cs.within([4 * (i % 5), 4 * (i // 5)], 1, name="goal")], [4 * (i % 5), 4 * (i // 5)]) for i in range(15)]
+    with cs.live(cs.Team(agents, [(f"q{i}", f"q{i + 1}") for i in range(14)]), seed=1, port=0, open_page=False, block=False) as live:
+        for tab in opened(browser, live.url):
+            for name in ("paths", "links"):
+                tab.get_by_label(name).uncheck()
+            until(tab, "consat.margin > 0.9")
+            x, y = tab.evaluate("consat.where('q7')")
+
+            def tinted(dx: float, tab: Tab = tab, x: float = x, y: float = y) -> bool:
+                """Whether the ground is, below the agent and in its goal."""
+                shot = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
+                return shot.getpixel((x + dx + 5, y + 25)) != (255, 255, 255)
+
+            assert [tinted(0), tinted(60)] == [True, False]
+            drag(tab, tab.evaluate("consat.handle('q7', 'goal')"), (60, 0))
+            tab.mouse.move(10, 300)
+            settle(lambda: [tinted(0), tinted(60)] == [False, True])
+            tab.keyboard.press("z")
+            settle(lambda: [tinted(0), tinted(60)] == [True, False])
+
+
+def settle(holds: Callable[[], Any]) -> None:
+    end = time.monotonic() + 20.0
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.1)
 
 
 def test_page_reconnects_when_the_server_is_there_again(browser: Browser) -> None:
@@ -191,6 +260,57 @@ def test_page_reconnects_when_the_server_is_there_again(browser: Browser) -> Non
         until(tab, "consat.margin > 0.9")
     for _ in pages:
         pass
+
+
+MODEL = """async ([code, page]) => {
+    const { default: widget } = await import(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
+    let heard = null;
+    const model = {
+        get: (name) => ({ page, height: 560 })[name], send: (content) => kernel(content), on: (_, hear) => { heard = hear; }, off() {},
+    };
+    window.hear = (content, buffers) => heard(content, buffers.map((text) => {
+        const bytes = Uint8Array.from(`--------${atob(text)}`, (each) => each.charCodeAt(0));  // a view into more, as notebooks have it
+        return new DataView(bytes.buffer, 8);
+    }));
+    window.close_ = widget.render({ model, el: document.body });
+}"""
+
+
+def test_widget_shows_the_team_and_a_mouse_drags_its_goal(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The notebook is this test: it carries the messages between the widget's two halves."""
+    with cs.live("case-b", widget=True, seed=1) as shown:
+        monkeypatch.setattr(type(shown), "comm", Comm())
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
+        tab = context.new_page()
+        tab.expose_function("kernel", lambda content: shown._handle_msg(message(content)))
+        tab.evaluate(MODEL, [shown._esm, shown.page])
+        read = 0
+
+        def until_framed(holds: str) -> Any:
+            nonlocal read
+            end = time.monotonic() + 60.0
+            while time.monotonic() < end:
+                for content, buffers in shown.comm.sent[read:]:
+                    read += 1
+                    tab.evaluate(
+                        "([content, buffers]) => hear(content, buffers)", [content, [b64encode(each).decode() for each in buffers]]
+                    )
+                if found := tab.frames[-1].evaluate(f"window.consat && ({holds})"):
+                    return found
+                tab.wait_for_timeout(20)
+            raise AssertionError(holds)
+
+        before = until_framed("consat.margin > 0.95 && consat.where('a1')")
+        box = tab.locator("iframe").bounding_box()
+        x, y = tab.frames[-1].evaluate("consat.handle('a1', 'goal')")
+        drag(tab, [box["x"] + x, box["y"] + y], (40, -40))
+        until_framed(f"consat.where('a1')[0] > {before[0] + 20} && consat.where('a1')[1] < {before[1] - 20}")
+        tab.evaluate("close_()")
+        end = time.monotonic() + 10.0
+        while shown._watchers:
+            assert time.monotonic() < end
+            tab.wait_for_timeout(20)
+        context.close()
 
 
 def test_replay_opens_from_disk_with_the_network_off(browser: Browser, tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ import pytest
 
 from consat.errors import InvalidSettings
 from consat.server import frames, orders
-from consat.server.app import Allowance, Client, Host
+from consat.server.app import Host, Watcher
 from consat.server.background import Background
 from consat.server.board import Board
+from consat.server.client import Allowance
 
 GOOD: list[dict[str, Any]] = [
     {"do": "change", "agent": "a", "constraint": "goal", "parameters": {"center": [3, 1.5], "radius": 2}, "id": 1, "gesture": 4},
@@ -150,11 +151,11 @@ class Silent:
 def test_slow_client_gets_the_newest_and_nothing_is_kept_for_it() -> None:
     async def hour() -> list[bytes]:
         simulation, socket = Silent(), Slow()
-        host, client = Host(simulation), Client(0, asyncio.get_running_loop())  # type: ignore[arg-type]
+        host, client = Host(simulation), Watcher(0, simulation, asyncio.get_running_loop())  # type: ignore[arg-type]
         sending = asyncio.create_task(host._send(socket, client))  # type: ignore[arg-type]
         for k in range(60 * 60 * 60):  # at 60 a second
             simulation.board.put("frame", b"%d" % k)
-            client.news.set()
+            client.came.set()
             if k % 1000 == 0:
                 await asyncio.sleep(0)
         for k in range(1000):

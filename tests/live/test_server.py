@@ -5,21 +5,25 @@ from __future__ import annotations
 import json
 import random
 import re
+import socket
+import sys
 import time
+import tracemalloc
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 import consat as cs
-from consat.cli import live as command
+from consat.cli import main
 from consat.errors import InvalidSettings, NetworkError
-from consat.server.app import MOST_CLIENTS, Allowance, Host
+from consat.server import handle
+from consat.server.app import Host
+from consat.server.client import MOST_CLIENTS, Allowance
 from tests.live.conftest import SOCKET, Page, pair
 from tests.live.test_orders import garbled
 
@@ -221,8 +225,46 @@ def test_handle_serves_and_closes() -> None:
         cs.live(pair(), port=-1)
 
 
-def test_command_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
-    found = CliRunner().invoke(command.live, ["case-b"])
-    assert found.exit_code == 2
-    assert "pip install 'consat[live]'" in found.output
+def test_client_that_reads_nothing_slows_nobody_and_nothing_is_kept_for_it() -> None:
+    with (
+        cs.live(pair(), port=0, open_page=False, block=False, seed=1) as live,
+        socket.create_connection(("127.0.0.1", int(live.url.split(":")[2].strip("/")))) as deaf,
+    ):
+        deaf.sendall(
+            b"GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        simulation = live._simulation
+        end = time.monotonic() + 60.0
+        while simulation._session.round < 5:  # it watches, so the team goes on
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        tracemalloc.start()
+        before, longest = simulation._session.round, 0.0
+        for _ in range(2000):  # 400 MB
+            begun = time.monotonic()
+            simulation.board.put("frame", bytes(200_000))
+            simulation.notify()
+            longest = max(longest, time.monotonic() - begun)
+            time.sleep(0.001)
+        kept, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert kept < 20_000_000
+        assert longest < 1.0
+        end = time.monotonic() + 60.0
+        while simulation._session.round < before + 20:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+
+def test_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(handle, "find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["consat", "live", "case-b"])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert "pip install 'consat[live]'" in said
+    assert said.count("\n") == 1
+    with pytest.raises(InvalidSettings, match=r"pip install 'consat\[notebook\]'"):
+        cs.live(pair(), widget=True)

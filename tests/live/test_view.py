@@ -14,7 +14,7 @@ BUILT = Path(__file__).parents[2] / "src" / "consat" / "views"
 NODE = shutil.which("node") is not None and (WEB / "node_modules" / "esbuild").is_dir()
 
 
-@pytest.mark.parametrize("name", ["live.js", "replay.js"])
+@pytest.mark.parametrize("name", ["live.js", "replay.js", "widget.js"])
 def test_view_is_small_and_loads_nothing_from_elsewhere(name: str) -> None:
     text = (BUILT / name).read_text(encoding="utf-8")
     assert len(text.encode()) <= 100_000

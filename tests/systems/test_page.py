@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import html
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 import consat as cs
+from tests.browser import BROWSER, needs_browser
 from tests.unit.test_views import made
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium; on Debian: apt-get install chromium")
+pytestmark = needs_browser
 
 
 def opened(page: Path, tmp_path: Path, size: str = "1280,800") -> str:

@@ -145,3 +145,4 @@ export function createChart(canvas: HTMLCanvasElement) {
     stepAt: (x: number) => first + ((x - LEFT) / (width - LEFT - 10)) * (final - first),
   };
 }
+export type Chart = ReturnType<typeof createChart>;

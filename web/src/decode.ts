@@ -67,7 +67,7 @@ export function frameAt(run: Recording, moment: number): Frame {
     step: (1 - share) * run.steps[a] + share * run.steps[b],
     sample: a,
     moment: at,
-    past: { length: run.samples, at: sample },
+    past: { length: run.samples, at: sample, name: "" },
   };
 }
 

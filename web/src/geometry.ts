@@ -99,24 +99,26 @@ const overlap = (a: Box, b: Box): boolean => a[0] < b[2] && b[0] < a[2] && a[1] 
 
 /**
  * Where names stand: for each point the offset of its text's left end of the baseline, so that it meets the fewest others.
- * `widths` in px; texts are 12 px high. Points that shall have no name have width 0.
+ * `widths` in px; texts are 12 px high. Points that shall have no name have width 0; all are
+ * drawn with radius `size`.
  */
 export function placeLabels(points: ArrayLike<Point>, widths: number[], [width, height]: Point, size = 7): Point[] {
   const taken: Box[] = Array.from(points, ([x, y]) => [x - size, y - size, x + size, y + size]);
   return Array.from(points, ([x, y], i) => {
     const wide = widths[i];
     if (wide === 0) return [0, 0];
+    const off = 0.7 * size + 4;
     const spots: Point[] = [
-      [9, -9],
-      [-9 - wide, -9],
-      [9, 19],
-      [-9 - wide, 19],
-      [-wide / 2, -13],
-      [-wide / 2, 23],
-      [14, 4],
-      [-14 - wide, 4],
-      [12, -24],
-      [12, 32],
+      [off, -off],
+      [-off - wide, -off],
+      [off, off + 10],
+      [-off - wide, off + 10],
+      [-wide / 2, -size - 6],
+      [-wide / 2, size + 16],
+      [size + 7, 4],
+      [-size - 7 - wide, 4],
+      [size + 5, -size - 17],
+      [size + 5, size + 25],
     ];
     const boxes = spots.map(([u, v]): Box => [x + u, y + v - 12, x + u + wide, y + v + 3]);
     const meets = boxes.map(
@@ -134,12 +136,10 @@ const BLUES = ["#a7d0e4", "#6bacd1", "#3783bb", "#1b5a9b"];
 
 /** A scale whose steps hold as many agents each: reds for violated, blues for satisfied, which the colour-blind can tell apart. */
 export function scaleOf(margins: ArrayLike<number>): Scale {
-  const finite = Array.from(margins)
-    .filter(Number.isFinite)
-    .sort((a, b) => a - b);
+  const finite = Float32Array.from(margins).filter(Number.isFinite).sort();
   const bad = finite.filter((value) => value <= 0);
   const good = finite.filter((value) => value > 0);
-  const quantile = (values: number[], share: number) => values[Math.min(values.length - 1, Math.floor(share * values.length))];
+  const quantile = (values: Float32Array, share: number) => values[Math.min(values.length - 1, Math.floor(share * values.length))];
   const edges: number[] = [];
   const shades: string[] = [];
   const inner = [0.25, 0.5, 0.75];
@@ -148,6 +148,20 @@ export function scaleOf(margins: ArrayLike<number>): Scale {
   edges.push(...below, 0, ...above);
   shades.push(...REDS.slice(0, below.length + 1), ...BLUES.slice(BLUES.length - above.length - 1));
   return { edges, shades };
+}
+
+/** The places of the least margins, the least first; agents without constraints come last. */
+export function tightest(margins: ArrayLike<number>, most: number): number[] {
+  const found: number[] = [];
+  const key = (i: number) => (Number.isFinite(margins[i]) ? margins[i] : Number.POSITIVE_INFINITY);
+  for (let i = 0; i < margins.length; i += 1) {
+    const mine = key(i);
+    if (found.length === most && mine >= key(found[most - 1])) continue;
+    let k = Math.min(found.length, most - 1);
+    for (; k > 0 && key(found[k - 1]) > mine; k -= 1) found[k] = found[k - 1];
+    found[k] = i;
+  }
+  return found;
 }
 
 export function shadeOf(scale: Scale, margin: number): string {

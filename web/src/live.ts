@@ -1,14 +1,14 @@
 // The live page: what the session tells is drawn, and what hands do becomes orders to it.
 
 import { createChart } from "./chart";
+import { agentInWords, bindControls, createRows, tellAt, watchHands } from "./controls";
 import { unpack } from "./decode";
-import { between, type Hit, type Point, scaleOf, shadeOf, turned } from "./geometry";
+import { between, type Hit, type Point, scaleOf, tightest, turned } from "./geometry";
 import { type Ball, FEW, type Frame, type Scene, say } from "./model";
-import { parts, preferDark } from "./page";
+import { parts } from "./page";
 import { createPanel } from "./panel";
 import { createPast } from "./past";
-import { type Answer, connect, type Message, socketAddress } from "./socket";
-import { THEMES } from "./theme";
+import { type Answer, type Carrier, connect, type Message } from "./socket";
 import { createView, type Held } from "./view";
 
 const SPEEDS = [1, 2, 5, 10, 20, 50, 100, 200, 500];
@@ -75,7 +75,7 @@ const EMPTY: Scene = {
   hues: [],
 };
 
-export function createLive(root: HTMLElement) {
+export function createLive(root: HTMLElement, carrier: Carrier) {
   const part = parts(root);
   const stage = part<HTMLCanvasElement>("stage");
   const slider = part<HTMLInputElement>("slider");
@@ -100,8 +100,7 @@ export function createLive(root: HTMLElement) {
   let adding = false;
   let gestures = Date.now();
   const hues = new Map<string, number>();
-  let fps = 0;
-  let dark = preferDark();
+  let between_ = 0;
   let dirty = true;
   let drawnAt = 0;
   let paneledAt = 0;
@@ -109,7 +108,7 @@ export function createLive(root: HTMLElement) {
   view.show.handles = true;
   view.show.messages = true;
 
-  const line = connect(socketAddress(window.location), {
+  const line = connect(carrier, {
     open(on) {
       connected = on;
       dirty = true;
@@ -192,6 +191,7 @@ export function createLive(root: HTMLElement) {
         if (drag?.begun && drag.held.kind !== "wall" && drag.held.kind !== "agent" && drag.held.k === Number(k)) continue;
         Object.assign(scene.balls[Number(k)], given);
       }
+      view.reshape();
       if (message.walls && !(drag?.begun && drag.held.kind === "wall")) scene.walls = message.walls;
       stale = true;
     },
@@ -325,7 +325,7 @@ export function createLive(root: HTMLElement) {
       where.set(drag.center, drag.held.k * scene.dimension);
     }
     const headings = before?.headings && now.headings ? turned(before.headings, now.headings, share) : now.headings;
-    const history = past.last(past.length - (share < 1 ? 1 : 0), TRAIL);
+    const history = past.last(past.length - (share < 1 || !scene.few ? 1 : 0), TRAIL);
     const step = (before?.round ?? now.round) * (1 - share) + now.round * share;
     return { ...now, where, headings, step, sample: history.length, moment: 0, past: history };
   }
@@ -336,14 +336,15 @@ export function createLive(root: HTMLElement) {
     const moving = now && before && time - now.at < 300;
     if (!dirty && !moving) return;
     dirty = false;
-    if (passed > 0 && passed < 1000) fps = fps ? 0.95 * fps + 50 / passed : 1000 / passed;
+    if (passed > 0 && passed < 1000) between_ = between_ ? 0.95 * between_ + 0.05 * passed : passed;
     drawnAt = time;
     const frame = frameNow(time);
     if (frame) {
       gone();
       view.draw(frame);
     }
-    api.fps = fps;
+    api.fps = between_ ? 1000 / between_ : 0;
+    api.drawn += 1;
     if (time - paneledAt > 100) {
       paneledAt = time;
       tell(frame);
@@ -383,53 +384,12 @@ export function createLive(root: HTMLElement) {
     table(frame);
   }
 
-  function table(frame: Frame): void {
-    const rows = part("rows");
-    const order = [...scene.ids.keys()];
-    const { margins } = frame;
-    const key = (i: number) => (Number.isFinite(margins[i]) ? margins[i] : Number.POSITIVE_INFINITY);
-    if (!scene.few) order.sort((a, b) => key(a) - key(b));
-    const shown: (number | string)[] = [...order.slice(0, FEW), ...Object.keys(state.silent)];
-    while (rows.children.length < shown.length) {
-      const row = document.createElement("button");
-      row.type = "button";
-      row.append(...["i", "b", "em", "span"].map((tag) => document.createElement(tag)));
-      row.addEventListener("click", () => {
-        if (row.dataset.silent) order_({ do: "revive", agent: row.dataset.silent });
-        else choose({ kind: "agent", k: Number(row.dataset.agent) });
-      });
-      rows.append(row);
-    }
-    while (rows.children.length > shown.length) rows.lastElementChild!.remove();
-    const theme = THEMES[dark ? "dark" : "light"];
-    const least = Math.min(...order.slice(0, FEW).map(key));
-    shown.forEach((who, k) => {
-      const row = rows.children[k] as HTMLElement;
-      const [dot, name, tag, told] = [...row.children] as HTMLElement[];
-      tag.className = "tag";
-      if (typeof who === "string") {
-        row.className = "silent";
-        row.dataset.silent = who;
-        row.setAttribute("aria-pressed", "false");
-        dot.style.background = "transparent";
-        name.textContent = who;
-        tag.hidden = true;
-        told.textContent = "killed: revive";
-        told.className = "";
-        return;
-      }
-      const margin = margins[who];
-      row.className = "";
-      delete row.dataset.silent;
-      row.dataset.agent = String(who);
-      row.setAttribute("aria-pressed", String(view.show.chosen?.kind === "agent" && view.show.chosen.k === who));
-      dot.style.background = scene.few ? theme.agents[(scene.hues[who] ?? who) % theme.agents.length] : shadeOf(scene.scale, margin);
-      name.textContent = scene.ids[who];
-      tag.textContent = "binds";
-      tag.hidden = !(margin <= least + 0.02 * Math.abs(least) + 1e-4);
-      told.textContent = Number.isFinite(margin) ? `${margin > 0 ? "✓" : "✗"} ${say(margin)}` : "no constraints";
-      told.className = margin > 0 || !Number.isFinite(margin) ? "" : "bad";
-    });
+  function table({ margins }: Frame): void {
+    const first = scene.few ? [...scene.ids.keys()] : tightest(margins, FEW);
+    const least = Math.min(...first.map((i) => margins[i]).filter(Number.isFinite));
+    const binds = (i: number) => margins[i] <= least + 0.02 * Math.abs(least) + 1e-4;
+    const killed = Object.keys(state.silent).map((silent) => ({ silent }));
+    rows(scene, margins, view.show.chosen, [...first.map((k) => ({ k, binds: binds(k) })), ...killed]);
   }
 
   // ---- orders
@@ -458,6 +418,7 @@ export function createLive(root: HTMLElement) {
       const center = ball.center.map((value, axis) => value + far * ([dx, dy][axis] ?? 0));
       const order = factor === 1 ? { center } : { radius: ball.radius * factor };
       Object.assign(ball, order);
+      view.reshape();
       order_({ do: "shape", scene: number, shape: k, ...order });
       dirty = true;
     },
@@ -524,6 +485,7 @@ export function createLive(root: HTMLElement) {
       if (!answer.ok) {
         of.order = null;
         if (ball) Object.assign(ball, { center: of.center, radius: of.radius });
+        view.reshape();
         if (drag === of) drag = null;
       } else {
         if (ball && order.scene === number) Object.assign(of, { center: order.center ?? of.center, radius: order.radius ?? of.radius });
@@ -571,6 +533,7 @@ export function createLive(root: HTMLElement) {
       if (held.kind === "agent") grabbed = Array.from(now!.where.subarray(held.k * scene.dimension, (held.k + 1) * scene.dimension));
       else grabbed = held.kind === "grip" ? [...scene.balls[held.k].center] : [];
       part("hint").hidden = true;
+      tip.hidden = true;
     }
     const round = (values: number[]) => values.map((value) => Number(value.toPrecision(7)));
     const { held } = of;
@@ -601,57 +564,42 @@ export function createLive(root: HTMLElement) {
     push(of);
   }
 
-  const pointers = new Map<number, Point>();
   let pressed: Hit | null = null;
-  let moved = false;
-  let apart = 0;
-  const gap = () => {
-    const [a, b] = [...pointers.values()];
-    return Math.hypot(a[0] - b[0], a[1] - b[1]);
-  };
   const reachOf = (event: PointerEvent) => (event.pointerType === "touch" ? TOUCH : MOUSE);
-  const local = (event: PointerEvent): Point => {
-    const box = stage.getBoundingClientRect();
-    return [event.clientX - box.left, event.clientY - box.top];
+  const redraw = () => {
+    dirty = true;
   };
 
-  stage.addEventListener("pointerdown", (event) => {
-    const at = local(event);
-    pointers.set(event.pointerId, at);
-    stage.setPointerCapture(event.pointerId);
-    moved = false;
-    if (pointers.size === 2) {
-      apart = gap();
+  watchHands(stage, view, () => scene.space, redraw, {
+    press(at, event) {
+      pressed = looking < 0 && !adding ? view.hit(...at, reachOf(event)) : null;
+      drag = pressed && event.button === 0 && !event.shiftKey ? take(pressed, at) : null;
+      view.show.held = drag && drag.held.kind !== "agent" ? drag.held : null;
+      return drag !== null;
+    },
+    pull(at) {
+      if (drag) pull(drag, at);
+      return drag?.begun === true;
+    },
+    drop() {
+      if (drag?.begun && drag.held.kind !== "agent") push(drag);
       drag = null;
-      return;
-    }
-    pressed = looking < 0 && !adding ? view.hit(...at, reachOf(event)) : null;
-    drag = pressed && event.button === 0 && !event.shiftKey ? take(pressed, at) : null;
-    view.show.held = drag && drag.held.kind !== "agent" ? drag.held : null;
-    dirty = true;
-  });
-  stage.addEventListener("pointermove", (event) => {
-    const at = local(event);
-    const from = pointers.get(event.pointerId);
-    if (from && pointers.size === 2) {
-      pointers.set(event.pointerId, at);
-      moved = true;
-      const wide = gap();
-      if (apart > 0) view.zoom(wide / apart, ...at);
-      apart = wide;
-      dirty = true;
-    } else if (from && drag) {
-      pull(drag, at);
-      moved = moved || drag?.begun === true;
-    } else if (from) {
-      const [dx, dy] = [at[0] - from[0], at[1] - from[1]];
-      if (!moved && Math.hypot(dx, dy) <= 3) return;
-      moved = true;
-      if (scene.space) view.orbit(dx, dy);
-      else view.pan(dx, dy);
-      pointers.set(event.pointerId, at);
-      dirty = true;
-    } else hover(at, reachOf(event));
+      view.show.held = null;
+    },
+    click(at) {
+      if (adding) addAgent(...at);
+      else if (pressed?.kind === "agent" || pressed?.kind === "link") choose({ kind: pressed.kind, k: pressed.k });
+      else if (pressed?.kind === "grip" || pressed?.kind === "rim") choose({ kind: "agent", k: scene.balls[pressed.k].owners[0] });
+      else if (view.show.chosen) choose(view.show.chosen);
+    },
+    hover(at, event) {
+      if (at) hover(at, reachOf(event));
+      else {
+        tip.hidden = true;
+        if (!drag) view.show.held = null;
+        dirty = true;
+      }
+    },
   });
 
   function hover(at: Point, reach: number): void {
@@ -668,19 +616,12 @@ export function createLive(root: HTMLElement) {
           : hit.kind === "link"
             ? "pointer"
             : "move";
-    const text = told(hit);
-    tip.hidden = !text;
-    tip.textContent = text;
-    tip.style.left = `${Math.min(at[0] + 14, stage.clientWidth - 230)}px`;
-    tip.style.top = `${Math.min(at[1] + 14, stage.clientHeight - 60)}px`;
+    tellAt(tip, stage, told(hit), at);
   }
 
   function told(hit: Hit | null): string {
     if (!hit || !now) return "";
-    if (hit.kind === "agent") {
-      const at = [...now.where.subarray(hit.k * scene.dimension, (hit.k + 1) * scene.dimension)].map((value) => say(value));
-      return `${scene.ids[hit.k]} at (${at.join(", ")})${scene.unit ? ` ${scene.unit}` : ""}, margin ${say(now.margins[hit.k])}`;
-    }
+    if (hit.kind === "agent") return agentInWords(scene, hit.k, now.where, now.margins[hit.k]);
     if (hit.kind === "link") return `link ${scene.ids[scene.links[2 * hit.k]]} – ${scene.ids[scene.links[2 * hit.k + 1]]}`;
     const shape = hit.kind === "wall" ? scene.walls[hit.k] : scene.balls[hit.k];
     const [owner, name] = [scene.ids[shape.owners[0]], shape.names[0]];
@@ -688,37 +629,6 @@ export function createLive(root: HTMLElement) {
     const size = hit.kind === "rim" ? `, radius ${say(scene.balls[hit.k].radius)}` : "";
     return `${owner}: ${name}${more}${size}`;
   }
-
-  const release = (event: PointerEvent) => {
-    const at = local(event);
-    pointers.delete(event.pointerId);
-    const was = drag;
-    if (drag?.begun && drag.held.kind !== "agent") push(drag);
-    if (!pointers.size) drag = null;
-    view.show.held = null;
-    dirty = true;
-    if (moved || was?.begun || event.type !== "pointerup") return;
-    if (adding) addAgent(...at);
-    else if (pressed?.kind === "agent" || pressed?.kind === "link") choose({ kind: pressed.kind, k: pressed.k });
-    else if (pressed?.kind === "grip" || pressed?.kind === "rim") choose({ kind: "agent", k: scene.balls[pressed.k].owners[0] });
-    else if (view.show.chosen) choose(view.show.chosen);
-  };
-  stage.addEventListener("pointerup", release);
-  stage.addEventListener("pointercancel", release);
-  stage.addEventListener("pointerleave", () => {
-    tip.hidden = true;
-    if (!drag) view.show.held = null;
-    dirty = true;
-  });
-  stage.addEventListener(
-    "wheel",
-    (event) => {
-      event.preventDefault();
-      view.zoom(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
-      dirty = true;
-    },
-    { passive: false },
-  );
 
   // ---- buttons and keys
 
@@ -745,7 +655,6 @@ export function createLive(root: HTMLElement) {
   click("next", step);
   click("undo", undo);
   click("restart", () => order_({ do: "restart" }));
-  click("fit", fit);
   click("add", () => toggleAdding(!adding));
   click("copy", async () => {
     const answer = await order_({ do: "text" });
@@ -770,10 +679,6 @@ export function createLive(root: HTMLElement) {
     panel.show(box);
     box.select();
   }
-  click("theme", () => {
-    dark = !dark;
-    paintTheme();
-  });
   slider.addEventListener("input", () => look(Math.round((Number(slider.value) / 1000) * (past.length - 1))));
   part("chart").addEventListener("pointerdown", (event) => {
     const at = chart.stepAt(event.offsetX);
@@ -787,15 +692,6 @@ export function createLive(root: HTMLElement) {
     part("lost").textContent = `${Math.round(100 * Number(part<HTMLInputElement>("loss").value))} %`;
   });
   part("loss").addEventListener("change", () => order_({ do: "loss", share: Number(part<HTMLInputElement>("loss").value) }));
-  for (const name of ["trails", "links", "regions", "names"] as const) {
-    const box = part<HTMLInputElement>(name);
-    box.checked = view.show[name];
-    box.addEventListener("change", () => {
-      view.show[name] = box.checked;
-      dirty = true;
-    });
-  }
-
   function away(): void {
     const { chosen } = view.show;
     if (chosen?.kind === "agent") order_({ do: "kill", agent: scene.ids[chosen.k] });
@@ -808,7 +704,6 @@ export function createLive(root: HTMLElement) {
     if (on instanceof HTMLSelectElement || on instanceof HTMLTextAreaElement || event.altKey) return;
     if (on instanceof HTMLInputElement && on.type !== "checkbox") return;
     if ((event.ctrlKey || event.metaKey) && event.key !== "z") return;
-    if (on instanceof HTMLElement && on.classList.contains("knob") && event.key !== "z") return;
     const keys: Record<string, () => void> = {
       " ": play,
       k: play,
@@ -833,15 +728,6 @@ export function createLive(root: HTMLElement) {
     dirty = true;
   });
 
-  function paintTheme(): void {
-    const name = dark ? "dark" : "light";
-    document.documentElement.dataset.theme = name;
-    view.theme(name);
-    chart.theme(name);
-    part("theme").setAttribute("aria-label", dark ? "Use light colours" : "Use dark colours");
-    dirty = true;
-  }
-
   const inPage = (at: Point | null): Point | null => {
     const box = stage.getBoundingClientRect();
     return at && [at[0] + box.left, at[1] + box.top];
@@ -853,6 +739,7 @@ export function createLive(root: HTMLElement) {
     bounds: null as [number | null, number | null] | null,
     reasons: [] as string[],
     fps: 0,
+    drawn: 0,
     latency: Number.NaN,
     agents: () => [...scene.ids],
     /** Where an agent is, in page pixels. */
@@ -884,14 +771,11 @@ export function createLive(root: HTMLElement) {
     send: (message: Record<string, unknown>) => order_(message),
   };
 
-  new ResizeObserver(() => {
-    view.resize();
-    chart.resize();
-    dirty = true;
-  }).observe(stage);
-  view.resize();
-  chart.resize();
-  paintTheme();
+  const dark = bindControls(part, view, chart, redraw);
+  const rows = createRows(part("rows"), dark, (who) => {
+    if ("silent" in who) order_({ do: "revive", agent: who.silent });
+    else choose({ kind: "agent", k: who.k });
+  });
   requestAnimationFrame(tick);
   return api;
 }

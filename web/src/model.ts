@@ -88,6 +88,8 @@ export interface Scene {
 export interface History {
   length: number;
   at(k: number): Float32Array;
+  /** Tells one from another of the same scene. */
+  name: string;
 }
 
 export interface Frame {

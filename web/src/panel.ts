@@ -85,10 +85,10 @@ export function createPanel(root: HTMLElement, doings: Doings) {
       );
       knob.addEventListener("keydown", (event) => {
         const arrow = ARROWS[event.key];
-        if (!arrow || !ball) return;
+        if (!arrow) return;
         event.preventDefault();
         event.stopPropagation();
-        doings.nudge(i, name, ...arrow);
+        if (ball) doings.nudge(i, name, ...arrow);
       });
       found.push(
         row(

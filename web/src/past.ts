@@ -52,7 +52,7 @@ export function createPast() {
     /** The last `most` of the first `count`. */
     last(count: number, most: number): History {
       const first = Math.max(0, count - most);
-      return { length: Math.max(0, count - first), at: (k) => places[first + k] };
+      return { length: Math.max(0, count - first), at: (k) => places[first + k], name: `${rounds[first]} ${rounds[count - 1]}` };
     },
   };
 }

@@ -1,11 +1,11 @@
 // Player of a recorded run: buttons, keys, the margin's chart, the table.
 
 import { createChart } from "./chart";
+import { agentInWords, bindControls, createRows, tellAt, watchHands } from "./controls";
 import { frameAt, type Recording } from "./decode";
-import { shadeOf } from "./geometry";
+import { type Point, tightest } from "./geometry";
 import { FEW, type Frame, say } from "./model";
-import { parts, preferDark } from "./page";
-import { THEMES } from "./theme";
+import { parts } from "./page";
 import { createView } from "./view";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
@@ -25,7 +25,7 @@ export function createPlayer(root: HTMLElement, run: Recording) {
   let speed = 1;
   let before = 0;
   let fps = 0;
-  let dark = preferDark();
+  let ready = false;
   let share = 0;
   const seconds = Math.min(20, Math.max(6, run.samples / 20));
   // Most happens at the beginning: moments are spread by the way travelled as much as by the clock.
@@ -43,33 +43,6 @@ export function createPlayer(root: HTMLElement, run: Recording) {
     return (a + (gap > 0 ? Math.min(1, (at - spread[a]) / gap) : 0)) / (spread.length - 1);
   };
 
-  function table(frame: Frame): void {
-    const order = [...run.ids.keys()];
-    const rows = part("rows");
-    const key = (i: number) => (Number.isFinite(frame.margins[i]) ? frame.margins[i] : Number.POSITIVE_INFINITY);
-    if (!run.few) order.sort((a, b) => key(a) - key(b));
-    const shown = order.slice(0, FEW);
-    while (rows.children.length < shown.length) {
-      const row = document.createElement("button");
-      row.type = "button";
-      row.append(document.createElement("i"), document.createElement("b"), document.createElement("span"));
-      row.addEventListener("click", () => choose(Number(row.dataset.agent)));
-      rows.append(row);
-    }
-    shown.forEach((i, k) => {
-      const row = rows.children[k] as HTMLElement;
-      const [dot, name, told] = [...row.children] as HTMLElement[];
-      const margin = frame.margins[i];
-      row.dataset.agent = String(i);
-      row.setAttribute("aria-pressed", String(view.show.chosen?.kind === "agent" && view.show.chosen.k === i));
-      const theme = THEMES[dark ? "dark" : "light"];
-      dot.style.background = run.few ? theme.agents[i % theme.agents.length] : shadeOf(run.scale, margin);
-      name.textContent = run.ids[i];
-      told.textContent = Number.isFinite(margin) ? `${margin > 0 ? "✓" : "✗"} ${say(margin)}` : "no constraints";
-      told.className = margin > 0 || !Number.isFinite(margin) ? "" : "bad";
-    });
-  }
-
   function paint(): Frame {
     const frame = frameAt(run, moment);
     view.draw(frame);
@@ -84,7 +57,13 @@ export function createPlayer(root: HTMLElement, run: Recording) {
         : "not every constraint holds now";
     slider.value = String(Math.round(1000 * share));
     slider.setAttribute("aria-valuetext", part("step").textContent ?? "");
-    table(frame);
+    const shown = run.few ? [...run.ids.keys()] : tightest(frame.margins, FEW);
+    rows(
+      run,
+      frame.margins,
+      view.show.chosen,
+      shown.map((k) => ({ k, binds: false })),
+    );
     Object.assign(api, { round: frame.step, margin: frame.margin, fps });
     return frame;
   }
@@ -135,15 +114,6 @@ export function createPlayer(root: HTMLElement, run: Recording) {
     describe();
   }
 
-  function paintTheme(): void {
-    const name = dark ? "dark" : "light";
-    document.documentElement.dataset.theme = name;
-    view.theme(name);
-    chart.theme(name);
-    part("theme").setAttribute("aria-label", dark ? "Use light colours" : "Use dark colours");
-    paint();
-  }
-
   function back(): void {
     toggle(false);
     seek(Math.ceil(moment) - 1);
@@ -166,25 +136,9 @@ export function createPlayer(root: HTMLElement, run: Recording) {
   part<HTMLSelectElement>("speed").addEventListener("change", (event) => {
     speed = Number((event.target as HTMLSelectElement).value);
   });
-  part("theme").addEventListener("click", () => {
-    dark = !dark;
-    paintTheme();
-  });
-  part("fit").addEventListener("click", () => {
-    view.fit();
-    paint();
-  });
-  for (const name of ["trails", "links", "regions", "names"] as const) {
-    const box = part<HTMLInputElement>(name);
-    if (name === "names" && !run.few) {
-      view.show.names = false;
-      box.closest("label")!.hidden = true;
-    }
-    box.checked = view.show[name];
-    box.addEventListener("change", () => {
-      view.show[name] = box.checked;
-      paint();
-    });
+  if (!run.few) {
+    view.show.names = false;
+    part("names").closest("label")!.hidden = true;
   }
   part("chart").addEventListener("pointerdown", (event) => {
     toggle(false);
@@ -226,72 +180,22 @@ export function createPlayer(root: HTMLElement, run: Recording) {
     keys[event.key]();
   });
 
-  const held = new Map<number, [number, number]>();
-  let moved = false;
-  let apart = 0;
-  const gap = () => {
-    const [a, b] = [...held.values()];
-    return Math.hypot(a[0] - b[0], a[1] - b[1]);
-  };
-  const under = (x: number, y: number) => {
-    const hit = view.hit(x, y, 14);
+  const under = (at: Point) => {
+    const hit = view.hit(...at, 14);
     return hit?.kind === "agent" ? hit.k : -1;
   };
-  stage.addEventListener("pointerdown", (event) => {
-    held.set(event.pointerId, [event.offsetX, event.offsetY]);
-    moved = false;
-    stage.setPointerCapture(event.pointerId);
-    if (held.size === 2) apart = gap();
-  });
-  stage.addEventListener("pointermove", (event) => {
-    const from = held.get(event.pointerId);
-    const here: [number, number] = [event.offsetX, event.offsetY];
-    if (from && held.size === 1) {
-      const [dx, dy] = [here[0] - from[0], here[1] - from[1]];
-      if (!moved && Math.hypot(dx, dy) <= 3) return;
-      moved = true;
-      if (run.space) view.orbit(dx, dy);
-      else view.pan(dx, dy);
-      held.set(event.pointerId, here);
-      paint();
-    } else if (from && held.size === 2) {
-      held.set(event.pointerId, here);
-      moved = true;
-      const now = gap();
-      if (apart > 0) view.zoom(now / apart, ...here);
-      apart = now;
-      paint();
-    } else {
-      const i = under(...here);
-      tip.hidden = i < 0;
+  watchHands(stage, view, () => run.space, paint, {
+    press: () => false,
+    pull: () => false,
+    drop() {},
+    click: (at) => choose(under(at)),
+    hover(at) {
+      const i = at ? under(at) : -1;
       stage.style.cursor = i < 0 ? "grab" : "pointer";
-      if (i >= 0) {
-        const frame = frameAt(run, moment);
-        const at = [...frame.where.subarray(i * run.dimension, (i + 1) * run.dimension)].map((value) => say(value));
-        tip.textContent = `${run.ids[i]} at (${at.join(", ")})${run.unit ? ` ${run.unit}` : ""}, margin ${say(frame.margins[i])}`;
-        tip.style.left = `${Math.min(here[0] + 14, stage.clientWidth - 230)}px`;
-        tip.style.top = `${here[1] + 14}px`;
-      }
-    }
-  });
-  const release = (event: PointerEvent) => {
-    held.delete(event.pointerId);
-    if (!moved && event.type === "pointerup") choose(under(event.offsetX, event.offsetY));
-  };
-  stage.addEventListener("pointerup", release);
-  stage.addEventListener("pointercancel", release);
-  stage.addEventListener("pointerleave", () => {
-    tip.hidden = true;
-  });
-  stage.addEventListener(
-    "wheel",
-    (event) => {
-      event.preventDefault();
-      view.zoom(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
-      paint();
+      const frame = i < 0 ? null : frameAt(run, moment);
+      tellAt(tip, stage, frame ? agentInWords(run, i, frame.where, frame.margins[i]) : "", at ?? [0, 0]);
     },
-    { passive: false },
-  );
+  });
   stage.addEventListener("dblclick", () => {
     view.fit();
     paint();
@@ -316,15 +220,14 @@ export function createPlayer(root: HTMLElement, run: Recording) {
     seek,
     toggle,
   };
-  view.resize();
-  chart.resize();
-  paintTheme();
+  const dark = bindControls(part, view, chart, () => {
+    if (ready) paint();
+  });
+  const rows = createRows(part("rows"), dark, (who) => {
+    if ("k" in who) choose(who.k);
+  });
+  ready = true;
   describe();
-  new ResizeObserver(() => {
-    view.resize();
-    chart.resize();
-    paint();
-  }).observe(stage);
   if (!window.matchMedia("(prefers-reduced-motion: reduce)").matches) toggle(true);
   else {
     share = 1;

@@ -1,4 +1,4 @@
-// The connection to the session. When it breaks it is taken up again, later and later up to some seconds.
+// The connection to the session: orders and their answers, over whatever carries messages.
 
 const FIRST = 300;
 const LONGEST = 4000;
@@ -20,58 +20,94 @@ export interface Listener {
   message(message: Message): void;
 }
 
-export function socketAddress(location: { protocol: string; host: string; search: string }): string {
-  return `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket${location.search}`;
+/** What carries messages. It tells when it opens and closes, and `send` whether the text is on its way. */
+export type Carrier = (ends: { open(on: boolean): void; data(data: string | ArrayBuffer): void }) => {
+  send(text: string): boolean;
+};
+
+/** A web socket. When it breaks it is opened again, later and later up to some seconds. */
+export function overSocket(location: { protocol: string; host: string; search: string }): Carrier {
+  const address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket${location.search}`;
+  return (ends) => {
+    let socket: WebSocket | null = null;
+    let wait = FIRST;
+    function open(): void {
+      socket = new WebSocket(address);
+      socket.binaryType = "arraybuffer";
+      socket.onopen = () => {
+        wait = FIRST;
+        ends.open(true);
+      };
+      socket.onmessage = (event) => ends.data(event.data);
+      socket.onclose = () => {
+        socket = null;
+        ends.open(false);
+        setTimeout(open, wait);
+        wait = Math.min(LONGEST, 1.6 * wait);
+      };
+    }
+    open();
+    return {
+      send(text) {
+        if (socket?.readyState !== WebSocket.OPEN) return false;
+        socket.send(text);
+        return true;
+      },
+    };
+  };
 }
 
-export function connect(address: string, listener: Listener) {
-  let socket: WebSocket | null = null;
-  let wait = FIRST;
+/** The port that a notebook's widget hands to the page that it frames; see widget.main.ts. */
+export function overPort(page: Window): Carrier {
+  return (ends) => {
+    let port: MessagePort | null = null;
+    page.addEventListener("message", (event) => {
+      if (event.source !== page.parent || !event.ports.length) return;
+      [port] = event.ports;
+      port.onmessage = ({ data }) => ends.data(data);
+      ends.open(true);
+    });
+    return {
+      send(text) {
+        port?.postMessage(text);
+        return port !== null;
+      },
+    };
+  };
+}
+
+export function connect(carrier: Carrier, listener: Listener) {
   let number = 0;
   const waiting = new Map<number, (answer: Answer) => void>();
-
-  function open(): void {
-    socket = new WebSocket(address);
-    socket.binaryType = "arraybuffer";
-    socket.onopen = () => {
-      wait = FIRST;
-      listener.open(true);
-    };
-    socket.onmessage = (event) => {
-      if (event.data instanceof ArrayBuffer) {
-        listener.frame(event.data);
+  const line = carrier({
+    open(on) {
+      if (!on) {
+        for (const [id, tell] of waiting) tell({ type: "answer", id, ok: false, words: "the connection broke" });
+        waiting.clear();
+      }
+      listener.open(on);
+    },
+    data(data) {
+      if (data instanceof ArrayBuffer) {
+        listener.frame(data);
         return;
       }
-      const message = JSON.parse(event.data);
+      const message = JSON.parse(data);
       if (message.type === "answer" && waiting.has(message.id)) {
         waiting.get(message.id)!(message);
         waiting.delete(message.id);
       }
       listener.message(message);
-    };
-    socket.onclose = () => {
-      socket = null;
-      for (const [id, tell] of waiting) tell({ type: "answer", id, ok: false, words: "the connection broke" });
-      waiting.clear();
-      listener.open(false);
-      setTimeout(open, wait);
-      wait = Math.min(LONGEST, 1.6 * wait);
-    };
-  }
-
-  open();
+    },
+  });
   return {
     /** Send an order; the promise gives its answer. */
     send(order: Record<string, unknown>): Promise<Answer> {
       number += 1;
       const id = number;
       return new Promise((resolve) => {
-        if (socket?.readyState !== WebSocket.OPEN) {
-          resolve({ type: "answer", id, ok: false, words: "there is no connection" });
-          return;
-        }
-        waiting.set(id, resolve);
-        socket.send(JSON.stringify({ ...order, id }));
+        if (line.send(JSON.stringify({ ...order, id }))) waiting.set(id, resolve);
+        else resolve({ type: "answer", id, ok: false, words: "there is no connection" });
       });
     },
   };

@@ -41,8 +41,20 @@ export interface Shown {
   messages: boolean;
 }
 
+/** A picture of what stands still, which is copied much faster than it is drawn. */
+interface Layer {
+  pen: CanvasRenderingContext2D;
+  /** Of what it is a picture. */
+  key: string;
+}
+
 export function createView(canvas: HTMLCanvasElement, first: Scene) {
-  const pen = canvas.getContext("2d", { alpha: false })!;
+  const screen = canvas.getContext("2d", { alpha: false })!;
+  /** What is being drawn on: the screen, or a layer. */
+  let pen = screen;
+  const ground: Layer = { pen: document.createElement("canvas").getContext("2d", { alpha: false })!, key: "" };
+  const trails: Layer = { pen: document.createElement("canvas").getContext("2d")!, key: "" };
+  let version = 0;
   let scene = first;
   let d = scene.dimension;
   let theme: Theme = THEMES.light;
@@ -87,10 +99,13 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     ratio = Math.max(1, window.devicePixelRatio || 1);
     width = Math.max(1, canvas.clientWidth);
     height = Math.max(1, canvas.clientHeight);
-    canvas.width = Math.round(width * ratio);
-    canvas.height = Math.round(height * ratio);
+    for (const each of [canvas, ground.pen.canvas, trails.pen.canvas]) {
+      each.width = Math.round(width * ratio);
+      each.height = Math.round(height * ratio);
+    }
     hatches = new Map();
     dots = new Map();
+    version += 1;
     if (!fitted || before[0] !== width || before[1] !== height) fit();
     if (last) draw(last);
   }
@@ -129,6 +144,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
   const agentColour = (i: number) => theme.agents[(scene.hues[i] ?? i) % theme.agents.length];
   const ownerColour = (owners: number[], out: boolean) =>
     scene.few && owners.length === 1 ? agentColour(owners[0]) : out ? theme.bar : scene.few ? theme.axis : theme.area;
+  const isHeld = (kind: Held["kind"], k: number) => show.held?.k === k && (show.held.kind === "wall") === (kind === "wall");
   const isChosen = (owners: number[]) => show.chosen?.kind === "agent" && owners.includes(show.chosen.k);
 
   function hatch(colour: string): CanvasPattern {
@@ -243,7 +259,9 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
 
   /** The goals of a crowd: overlaps are tinted once, and of very many no edges are drawn. */
   function drawUnion(frame: Frame): void {
-    const goals = scene.balls.filter((ball) => !ball.out && ball.around < 0).map((ball) => ballAt(ball, frame.moment));
+    const goals = scene.balls
+      .filter((ball, k) => !ball.out && ball.around < 0 && !isHeld("grip", k) && !isChosen(ball.owners))
+      .map((ball) => ballAt(ball, frame.moment));
     pen.beginPath();
     for (const ball of goals) {
       const at = ballCenter(frame.where, ball);
@@ -372,7 +390,8 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         pen.moveTo(a[0], a[1]);
         pen.lineTo(b[0], b[1]);
         const text = String(Number(value.toPrecision(6))).replace("-", "−");
-        if (!scene.space && (axis ? a[1] < height - 22 : a[0] > 4)) labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
+        if (!scene.space && (axis ? a[1] > 16 && a[1] < height - 22 : a[0] > 4))
+          labels.push(axis ? [text, 4, a[1] - 3] : [text, a[0] + 3, height - 5]);
       }
     }
     pen.stroke();
@@ -406,13 +425,14 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
 
   // ---- what moves
 
-  function drawTrails(frame: Frame): void {
+  function drawTrails(frame: Frame, camera: string): void {
     const { past, sample } = frame;
     if (scene.count > MOST_TRAILS) return;
-    const stride = Math.max(1, Math.ceil(((sample + 1) * scene.count) / MOST_SEGMENTS));
+    const count = Math.min(sample + 1, past.length);
+    const stride = Math.max(1, Math.ceil((count * scene.count) / MOST_SEGMENTS));
     const one = (i: number) => {
       let on = false;
-      for (let s = 0; s <= sample && s < past.length; s += stride) {
+      for (let s = 0; s < count; s += stride) {
         const x = past.at(s);
         if (!Number.isFinite(x[i * d])) {
           on = false;
@@ -423,10 +443,10 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         else pen.moveTo(px, py);
         on = true;
       }
-      if (on) pen.lineTo(places[i][0], places[i][1]);
+      if (scene.few && on) pen.lineTo(places[i][0], places[i][1]);
     };
-    pen.lineJoin = "round";
     if (scene.few) {
+      pen.lineJoin = "round";
       pen.lineWidth = 1.8;
       pen.globalAlpha = 0.7;
       for (let i = 0; i < scene.count; i += 1) {
@@ -435,14 +455,18 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
         one(i);
         pen.stroke();
       }
-    } else {
-      pen.strokeStyle = theme.trail;
-      pen.lineWidth = 1;
-      pen.beginPath();
-      for (let i = 0; i < scene.count; i += 1) one(i);
-      pen.stroke();
+      pen.globalAlpha = 1;
+    } else if (count) {
+      // Of a crowd anew with each round, not with each frame between two.
+      copied(trails, [camera, count, past.name].join(), () => {
+        pen.lineJoin = "round";
+        pen.strokeStyle = theme.trail;
+        pen.lineWidth = 1;
+        pen.beginPath();
+        for (let i = 0; i < scene.count; i += 1) one(i);
+        pen.stroke();
+      });
     }
-    pen.globalAlpha = 1;
   }
 
   function drawLinks(frame: Frame): void {
@@ -574,7 +598,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       }
       for (const [colour, members] of groups) {
         pen.fillStyle = colour;
-        for (const i of members) pen.fillRect(places[i][0] - radius, places[i][1] - radius, 2 * radius, 2 * radius);
+        for (const i of members) pen.fillRect(Math.round(places[i][0]) - radius, Math.round(places[i][1]) - radius, 2 * radius, 2 * radius);
       }
     } else {
       for (let i = 0; i < scene.count; i += 1) {
@@ -609,21 +633,22 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       ring(chosen, 7);
       pen.stroke();
     }
-    drawNames(chosen);
+    drawNames(frame, chosen);
   }
 
-  function drawNames(chosen: number): void {
+  function drawNames(frame: Frame, chosen: number): void {
     pen.font = "600 13px system-ui, sans-serif";
     pen.lineJoin = "round";
     const who = show.names && scene.few ? [...scene.ids.keys()] : chosen >= 0 ? [chosen] : [];
     if (!who.length) return;
     const texts = who.map((i) => (scene.ids[i].length > 16 ? `${scene.ids[i].slice(0, 15)}…` : scene.ids[i]));
-    const at = who.map((i) => places[i]);
+    const bodies = scene.bodies && who.map((i) => bodyOf(frame, i));
+    const at = bodies ? bodies.map(({ middle }) => middle) : who.map((i) => places[i]);
     const offsets = placeLabels(
       at,
       texts.map((text) => pen.measureText(text).width),
       [width, height],
-      Math.max(7, scale * Math.max(0, ...who.map((i) => scene.bodies?.radius[i] ?? 0))),
+      Math.max(7, ...(bodies ?? []).map(({ r }) => r + 4)),
     );
     texts.forEach((text, k) => {
       const [px, py] = [at[k][0] + offsets[k][0], at[k][1] + offsets[k][1]];
@@ -635,34 +660,67 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     });
   }
 
-  function draw(frame: Frame): void {
-    last = frame;
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  /** Draw what stands still on a layer, if it is not there yet, and copy it. */
+  function copied(layer: Layer, key: string, paint: () => void): void {
+    if (layer.key !== key) {
+      layer.key = key;
+      pen = layer.pen;
+      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      pen.clearRect(0, 0, width, height);
+      paint();
+      pen = screen;
+    }
+    pen.drawImage(layer.pen.canvas, 0, 0, width, height);
+  }
+
+  function drawGround(): void {
     pen.fillStyle = theme.paper;
     pen.fillRect(0, 0, width, height);
-    places.length = scene.count;
-    for (let i = 0; i < scene.count; i += 1) places[i] = spot(frame.where, i);
     drawGrid();
     if (scene.space) drawAxes();
     scene.obstacles.forEach(drawObstacle);
-    const isHeld = (kind: Held["kind"], k: number) => show.held?.k === k && (show.held.kind === "wall") === (kind === "wall");
-    if (show.regions) {
-      scene.walls.forEach((wall, k) => {
-        drawWall(wall, isHeld("wall", k));
-      });
-      if (!scene.few && !scene.space) drawUnion(frame);
-      for (const out of [false, true]) {
-        scene.balls.forEach((ball, k) => {
-          const alone = ball.out || scene.few || scene.space;
-          if (alone && ball.out === out && !isChosen(ball.owners)) drawBall(frame, ball, false, isHeld("grip", k));
-        });
-      }
-      for (const outline of scene.outlines) drawOutline(frame, outline);
-    }
-    scene.balls.forEach((ball, k) => {
-      if (isChosen(ball.owners) || (!scene.few && isHeld("grip", k))) drawBall(frame, ball, true, isHeld("grip", k));
+  }
+
+  /** Regions, but those that are held or chosen. */
+  function drawRegions(frame: Frame): void {
+    scene.walls.forEach((wall, k) => {
+      if (!isHeld("wall", k)) drawWall(wall, false);
     });
-    if (show.trails) drawTrails(frame);
+    if (!scene.few && !scene.space) drawUnion(frame);
+    for (const out of [false, true]) {
+      scene.balls.forEach((ball, k) => {
+        const alone = ball.out || scene.few || scene.space;
+        if (alone && ball.out === out && !isChosen(ball.owners) && !isHeld("grip", k)) drawBall(frame, ball, false, false);
+      });
+    }
+  }
+
+  function draw(frame: Frame): void {
+    last = frame;
+    places.length = scene.count;
+    for (let i = 0; i < scene.count; i += 1) places[i] = spot(frame.where, i);
+    screen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const camera = [version, scale, ...center, yaw, pitch].join();
+    if (scene.few) {
+      drawGround();
+      if (show.regions) drawRegions(frame);
+    } else {
+      // In a crowd regions stand still: those that move with a teammate are not drawn.
+      const moment = scene.balls.some((ball) => ball.track) ? frame.moment : 0;
+      const { held, chosen, regions } = show;
+      copied(ground, [camera, moment, regions, held?.kind, held?.k, chosen?.kind, chosen?.k].join(), () => {
+        drawGround();
+        if (regions) drawRegions(frame);
+      });
+    }
+    if (show.regions) for (const outline of scene.outlines) drawOutline(frame, outline);
+    scene.walls.forEach((wall, k) => {
+      if (isHeld("wall", k)) drawWall(wall, true);
+    });
+    scene.balls.forEach((ball, k) => {
+      if (isChosen(ball.owners) || isHeld("grip", k)) drawBall(frame, ball, !scene.few || isChosen(ball.owners), isHeld("grip", k));
+    });
+    if (show.trails) drawTrails(frame, camera);
     if (show.links) drawLinks(frame);
     drawGone();
     if (scene.bodies) drawBodies(frame);
@@ -720,7 +778,12 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       scene = next;
       d = scene.dimension;
       dots = new Map();
+      version += 1;
       if (fresh) fit();
+    },
+    /** Regions have changed. */
+    reshape() {
+      version += 1;
     },
     where: (i: number): Point | null => (last && i < scene.count ? spot(last.where, i) : null),
     hit: (px: number, py: number, reach: number): Hit | null => (last ? hitTest(targets(), px, py, reach) : null),
@@ -751,6 +814,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       theme = THEMES[name];
       hatches = new Map();
       dots = new Map();
+      version += 1;
     },
   };
 }

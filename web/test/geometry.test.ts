@@ -1,9 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { unpack } from "../src/decode";
-import { between, type Disc, gripOf, hitTest, type Point, placeLabels, scaleOf, shadeOf, type Targets } from "../src/geometry";
+import { between, type Disc, gripOf, hitTest, type Point, placeLabels, scaleOf, shadeOf, type Targets, tightest } from "../src/geometry";
 import { createPast } from "../src/past";
-import { socketAddress } from "../src/socket";
 
 const disc = (x: number, y: number, r: number, more: Partial<Disc> = {}): Disc => ({
   x,
@@ -117,7 +116,13 @@ test("who was not there was nowhere", () => {
   assert.deepEqual([...past.at(0)], [3, 4, Number.NaN, Number.NaN]);
 });
 
-test("between, and where the socket is", () => {
+test("the tightest are those that a sort would put first", () => {
+  const margins = Array.from({ length: 500 }, (_, i) => (i % 50 === 7 ? Number.POSITIVE_INFINITY : Math.sin(7 * i)));
+  const sorted = [...margins.keys()].sort((a, b) => margins[a] - margins[b]);
+  assert.deepEqual(tightest(margins, 12), sorted.slice(0, 12));
+  assert.deepEqual(tightest([Number.NaN, 2, 1], 12), [2, 1, 0]);
+});
+
+test("between", () => {
   assert.deepEqual([...between(new Float32Array([0, 2]), new Float32Array([1, 4]), 0.5)], [0.5, 3]);
-  assert.equal(socketAddress({ protocol: "https:", host: "a:1", search: "?token=x" }), "wss://a:1/socket?token=x");
 });

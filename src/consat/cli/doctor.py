@@ -25,6 +25,7 @@ EXTRAS: Final[Mapping[str, Sequence[str]]] = {
     "mcap": ("foxglove-sdk",),
     "mujoco": ("mujoco-core",),
     "network": ("cryptography", "eclipse-zenoh"),
+    "notebook": ("anywidget",),
     "video": ("av",),
 }
 """For each extra the libraries that it installs."""

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-from importlib.util import find_spec
 from typing import Any
 
 import click
 
 from consat.cli.terminal import located, scenario_argument, set_option
 from consat.network.deploy.environment import keep_compilations
-
-NEEDED = ("starlette", "uvicorn", "websockets")
 
 
 @click.command()
@@ -29,15 +26,16 @@ def live(scenario: str, overrides: tuple[str, ...], host: str, port: int | None,
     FILE is a scenario. The page shows the team as it runs: drag its goals, kill agents, cut links. Ctrl-C ends it.
     """
     keep_compilations(os.environ)
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        raise click.UsageError(f"the live page needs {', '.join(missing)}; install them with: pip install 'consat[live]'")
     from consat.scenario import load
     from consat.server.handle import live as serve
+    from consat.server.handle import require
+
+    require()
 
     loaded = load(scenario, overrides)
     click.echo(f"compiling {loaded.name} …", err=True)
     with located(loaded):
-        page = serve(loaded, host=host, port=port, open_page=False, block=False, **settings)
+        page = serve(loaded, host=host, port=port, open_page=False, block=False, widget=False, **settings)
     click.echo(page.url)
     click.echo("Ctrl-C ends it", err=True)
     if opens:

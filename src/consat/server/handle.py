@@ -10,18 +10,20 @@ import threading
 import time
 import webbrowser
 from contextlib import ExitStack
-from typing import Any, Self
-
-import uvicorn
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, overload
 
 from consat.errors import InvalidSettings, NetworkError
 from consat.problem.team import Team
 from consat.scenario import Scenario
-from consat.server.app import LOOPBACK, Host
 from consat.server.simulation import Simulation
 
-PORT = 8137
-LARGEST = 65536
+if TYPE_CHECKING:
+    from consat.server.widget import LiveWidget
+
+NEEDED: Final = ("starlette", "uvicorn", "websockets")
+PORT: Final = 8137
+LARGEST: Final = 65536
 """Bytes of a message at which a client is shut out; shorter ones that are too long are answered."""
 
 
@@ -38,6 +40,10 @@ class Live:
     """
 
     def __init__(self, simulation: Simulation, host: str, listening: socket.socket) -> None:
+        import uvicorn
+
+        from consat.server.app import LOOPBACK, Host
+
         token = None if host in LOOPBACK else secrets.token_urlsafe(24)
         number = listening.getsockname()[1]
         name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host  # noqa: S104
@@ -85,11 +91,21 @@ class Live:
         return f"<Live {self._simulation.name} at {self.url}{'' if self.alive else ', closed'}>"
 
 
+@overload
+def live(
+    team: Team | Scenario | str, *, host: str = ..., port: int | None = ..., open_page: bool = ..., block: bool | None = ...,
+    widget: Literal[False], **settings: Any,
+) -> Live: ...  # fmt: skip
+@overload
+def live(
+    team: Team | Scenario | str, *, host: str = ..., port: int | None = ..., open_page: bool = ..., block: bool | None = ...,
+    widget: bool | None = ..., **settings: Any,
+) -> Live | LiveWidget: ...  # fmt: skip
 def live(
     team: Team | Scenario | str, *, host: str = "127.0.0.1", port: int | None = None, open_page: bool = True, block: bool | None = None,
-    **settings: Any,
-) -> Live:  # fmt: skip
-    """Watch a team, and take hold of it, on a page.
+    widget: bool | None = None, **settings: Any,
+) -> Live | LiveWidget:  # fmt: skip
+    """Watch a team, and take hold of it, on a page, or in a notebook as a widget.
 
     Args:
         team: a `consat.Team` or a scenario, as in `consat.run`.
@@ -97,17 +113,27 @@ def live(
         port: to listen on, 0 for a free one; if None, 8137, or a free one where that is taken.
         open_page: whether to open a browser.
         block: whether to return only when it ends, with Ctrl-C; by default so in scripts, not where Python is used interactively.
+        widget: whether to return a widget, which listens nowhere; by default so in notebooks, unless a port is given.
         settings: as of `consat.Session`, such as ``protocol``, ``seed`` and ``loss``.
 
     Returns:
-        a handle with ``url`` and ``close()``.
+        a handle with ``url`` and ``close()``, or the widget, with ``close()``.
 
     Raises:
         NetworkError: nothing can listen there.
+        InvalidSettings: what it needs is not installed; the message says how to install it.
         ConsatError: as `consat.Session`.
     """
     if port is not None and (not isinstance(port, int) or isinstance(port, bool) or not 0 <= port < 65536):
         raise InvalidSettings(f"port is {port!r}, but must be a whole number from 0 to 65535")
+    if widget or (widget is None and port is None and in_notebook()):
+        if find_spec("anywidget") is None:
+            serve = "or have the page served, with a port: consat.live(team, port=0)"
+            raise InvalidSettings(f"the widget needs anywidget; install it with: pip install 'consat[notebook]', {serve}")
+        from consat.server.widget import LiveWidget
+
+        return LiveWidget(Simulation(team, **settings))
+    require()
     with ExitStack() as stack:
         listening = stack.enter_context(_bound(host, port))
         found = Live(Simulation(team, **settings), host, listening)
@@ -116,6 +142,26 @@ def live(
         webbrowser.open(found.url)
     interactive = hasattr(sys, "ps1") or "ipykernel" in sys.modules
     return found if block is False or (block is None and interactive) else found.wait()
+
+
+def require() -> None:
+    """Raises: InvalidSettings: what the page's server needs is not installed."""
+    if missing := [name for name in NEEDED if find_spec(name) is None]:
+        raise InvalidSettings(f"the live page needs {', '.join(missing)}; install them with: pip install 'consat[live]'")
+
+
+def in_notebook() -> bool:
+    """Whether a cell shows what it returns: Jupyter, VS Code and marimo."""
+    if "marimo" in sys.modules:
+        import marimo
+
+        if marimo.running_in_notebook():
+            return True
+    if "IPython" not in sys.modules:
+        return False
+    from IPython import get_ipython
+
+    return getattr(get_ipython(), "kernel", None) is not None
 
 
 def _bound(host: str, port: int | None) -> socket.socket:
