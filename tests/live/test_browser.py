@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 import consat as cs
+from consat.server import simulation
 from tests.browser import BROWSER, needs_browser
 from tests.live.test_widget import Comm, message
 
@@ -107,6 +108,35 @@ def test_team_torn_apart_says_why(tab: Tab) -> None:
     assert "cannot all hold" in tab.locator("[data-part=reasons]").inner_text()
     tab.keyboard.press("z")
     until(tab, "consat.verdict == 'feasible' && consat.margin > 0.9")
+
+
+def test_nothing_is_said_to_be_proven_of_a_team_that_has_changed_since(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Assessments that take long come in while the goal moves on: the page goes on saying that it assesses."""
+    find = simulation.assessed
+    monkeypatch.setattr(simulation, "assessed", lambda team: (time.sleep(0.4), find(team))[1])
+    watch = """() => {
+        window.seen = [];
+        const read = (name) => document.querySelector(`[data-part=${name}]`).textContent;
+        setInterval(() => window.seen.push([read("verdict"), read("margin")]), 20);
+    }"""
+    with cs.live("case-b", seed=1, port=0, open_page=False, block=False) as own:
+        for tab in opened(browser, own.url):
+            until(tab, "consat.margin > 0.9 && consat.verdict == 'feasible'")
+            drag(tab, tab.evaluate("consat.handle('a1', 'goal')"), (330, 0))
+            until(tab, "consat.verdict == 'infeasible' && consat.margin < consat.bounds[1] + 0.01")
+            tab.evaluate(watch)
+            x, y = tab.evaluate("consat.handle('a1', 'goal')")
+            tab.mouse.move(x, y)
+            tab.mouse.down()
+            for step in range(14):
+                tab.mouse.move(x - 22 * step, y)
+                tab.wait_for_timeout(250)
+            tab.mouse.up()
+            until(tab, "consat.verdict == 'feasible' && consat.margin > 0.5")
+            number = lambda text: float(text.split()[-1].replace("−", "-"))  # noqa: E731
+            seen = [(words, number(margin)) for words, margin in tab.evaluate("window.seen")]
+            assert len({words for words, _ in seen}) >= 3
+            assert not [(words, margin) for words, margin in seen if "can't be done" in words and margin > number(words) + 0.02]
 
 
 def test_agent_is_killed_and_revived_and_a_link_that_must_stay_is_not_cut(tab: Tab) -> None:

@@ -91,7 +91,11 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
   let bounds: [number | null, number | null] | null = null;
   let verdict = "undecided";
   let reasons: string[] = [];
-  let stale = true;
+  /** The revision of the team that the session is known to have reached, and the one that the verdict is of. */
+  let reached = 0;
+  let assessed = -1;
+  /** Whether the verdict may be of a team that has changed since, here or there. */
+  const stale = () => assessed < reached || line.busy() || drag?.order != null;
   let connected = false;
   let before: Moment | null = null;
   let now: Moment | null = null;
@@ -111,6 +115,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
   const line = connect(carrier, {
     open(on) {
       connected = on;
+      assessed = -1;
       dirty = true;
       if (on) hush("connection");
       else say_("the connection to the session is gone; trying again", true, "connection");
@@ -181,7 +186,6 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       part("names").closest("label")!.hidden = !scene.few;
       const k = who === null ? -1 : ids.indexOf(who);
       view.show.chosen = k >= 0 ? { kind: "agent", k } : null;
-      stale = true;
       gone();
       panel.update();
     },
@@ -193,7 +197,6 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       }
       view.reshape();
       if (message.walls && !(drag?.begun && drag.held.kind === "wall")) scene.walls = message.walls;
-      stale = true;
     },
     outlines(message: Message) {
       if (message.number === number) scene.outlines = message.outlines;
@@ -201,6 +204,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     state(message: Message) {
       const { playing } = state;
       state = message;
+      reached = message.revision;
       gone();
       part("play").textContent = state.playing ? "❚❚" : "▶";
       part("play").setAttribute("aria-label", state.playing ? "Pause" : "Play");
@@ -218,7 +222,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       verdict = message.verdict;
       bounds = message.bounds;
       reasons = message.reasons;
-      stale = false;
+      assessed = message.revision;
       api.verdict = verdict;
       api.bounds = bounds;
       api.reasons = reasons;
@@ -226,6 +230,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       part("live").textContent = `${verdict}. ${reasons.join(" ")}`;
     },
     answer(message: Message) {
+      reached = Math.max(reached, message.revision ?? 0);
       if (!message.ok) say_(message.words, true);
     },
   };
@@ -262,8 +267,8 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
             ? `best margin at least ${say(lower)}`
             : "";
     const words = { feasible: "✓ feasible, proven", infeasible: "✗ can't be done, proven", undecided: "? undecided" }[verdict] ?? verdict;
-    out.textContent = stale ? `assessing … (before: ${verdict})` : [words, range].filter(Boolean).join("; ");
-    out.className = stale ? "stale" : verdict === "feasible" ? "good" : verdict === "infeasible" ? "bad" : "";
+    out.textContent = stale() ? `assessing … (before: ${verdict})` : [words, range].filter(Boolean).join("; ");
+    out.className = stale() ? "stale" : verdict === "feasible" ? "good" : verdict === "infeasible" ? "bad" : "";
     const list = part("reasons");
     if (list.dataset.said !== reasons.join("\n")) {
       list.dataset.said = reasons.join("\n");
@@ -275,7 +280,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
         }),
       );
     }
-    list.style.opacity = stale ? "0.6" : "";
+    list.style.opacity = stale() ? "0.6" : "";
   }
 
   function describe(): void {
@@ -374,7 +379,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
         margin: past.margins,
         count: past.length,
         clock: "round",
-        bounds: stale ? null : bounds,
+        bounds: stale() ? null : bounds,
         since: null,
         bound: null,
         verdicts: [],
@@ -559,7 +564,6 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       wall.offset = offset;
       of.order = { do: "wall", scene: number, wall: wall.place, offset, gesture: of.gesture };
     }
-    stale = true;
     dirty = true;
     push(of);
   }

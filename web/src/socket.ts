@@ -101,6 +101,8 @@ export function connect(carrier: Carrier, listener: Listener) {
     },
   });
   return {
+    /** Whether an order waits for its answer. */
+    busy: () => waiting.size > 0,
     /** Send an order; the promise gives its answer. */
     send(order: Record<string, unknown>): Promise<Answer> {
       number += 1;

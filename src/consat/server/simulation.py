@@ -234,7 +234,7 @@ class Simulation:
             if self._busy is not None:
                 self._busy = None
                 self._show_state()
-        return {"type": "answer", "ok": True, "words": "", **found}
+        return {"type": "answer", "ok": True, "words": "", "revision": self._revision, **found}
 
     # ---- orders -------------------------------------------------------------------------------------------------------------------------
 
@@ -571,7 +571,7 @@ class Simulation:
     def _show_state(self) -> None:
         session = self._session
         self._show("state", {
-            "type": "state", "playing": self._playing, "speed": self._speed, "loss": self._loss, "protocol": self._protocol,
+            "type": "state", "revision": self._revision, "playing": self._playing, "speed": self._speed, "loss": self._loss, "protocol": self._protocol,
             "rate": session.rate, "undo": len(self._undos), "busy": self._busy, "cut": self._cut,
             "silent": {name: np.asarray(each.agent.start)[:3].tolist() for name, each in self._silent.items()},
         })  # fmt: skip
@@ -583,6 +583,7 @@ class Simulation:
     def _changed(self) -> None:
         """What was proven holds no more."""
         self._revision += 1
+        self._show_state()
         team = self._session.team
         self._assessor.ask((self._revision, team.at(self._session.time) if len(team.owner) <= MOST_ASSESSED else None))
 
