@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from consat.engine.recording import Choice
-from consat.engine.round import SATISFIED, Now, Seen, World, begin, one_round, see
+from consat.engine.round import SATISFIED, Now, Seen, Sent, World, begin, one_round, see
 from consat.engine.violations import violated
 from consat.numerics import quick_compilation, thorough_compilation
 from consat.protocols import Rounds
@@ -29,7 +29,7 @@ SURE = 3
 """For so many rounds on end all must know what ends a run: what they have heard of the others' margins is some rounds old."""
 NEVER = 2**62
 """More rounds than there are."""
-SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats")
+SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats", "bytes")
 """Of what is seen of a round, the numbers that every chunk tells."""
 
 
@@ -61,6 +61,7 @@ class Chunk(NamedTuple):
         near: for how many rounds everybody has known what ends the run.
         messages: (CHUNK,) sent.
         floats: (CHUNK,) sent.
+        bytes: (CHUNK,) sent.
         drift: how far any position was, on any axis, from where it was before; not finite if a position is not.
         violated: (W,) after how many of them each watched constraint was violated; None where nobody counts.
         kept: of every so manieth round, with a leading axis; what stands beyond these means nothing.
@@ -74,6 +75,7 @@ class Chunk(NamedTuple):
     near: Any
     messages: Any
     floats: Any
+    bytes: Any
     drift: Any
     violated: Any
     kept: Kept
@@ -192,6 +194,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         near=ask.near,
         messages=jnp.zeros(CHUNK, whole),
         floats=jnp.zeros(CHUNK, whole),
+        bytes=jnp.zeros(CHUNK, whole),
         drift=jnp.zeros((), real),
         violated=jnp.zeros(len(chosen.watched), whole),
         kept=Kept(
@@ -239,7 +242,7 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
 
 def _look(world: World, chosen: Chosen, now: Now, number: Array) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world.at(number), now, (nothing, nothing), (nothing, nothing)))
+    return chosen.of_seen(see(world.at(number), now, (nothing, nothing), Sent(nothing, nothing, nothing)))
 
 
 @functools.cache

@@ -66,6 +66,8 @@ class Admm:
             can turn about each other in a cycle, which a stiffer penalty of theirs breaks.
         fall: by which part it may fall while a message crosses the team, once the agent knows that all are satisfied.
         horizon: after so many crossings the moves die out, so that ρ settles and convergence is that of fixed ρ.
+        tolerance: where agents send what is news, how far a point may be, in the team's unit of length, from what its neighbour holds, …
+        loose: … and by which part a penalty may.
     """
 
     relaxation: float = 0.7
@@ -77,6 +79,8 @@ class Admm:
     hurry: float = 10.0
     fall: float = 0.2
     horizon: float = 50.0
+    tolerance: float = 1e-4
+    loose: float = 0.1
     name = "admm"
     speaks: ClassVar[str] = "link"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "u": "link", "wish": "row", "heard": "link", "penalty": "link", "memory": "agent"}
@@ -115,6 +119,14 @@ class Admm:
         wish = jnp.clip(jnp.maximum(goal, least), lowest, wish * (1.0 + solver.to_rows(rise)))
         here = links.at(x)
         return AdmmState(x, u, wish, state.heard, rho, memory), (here, rho[:, None] * (u - here), links.at(wish))
+
+    def news(self, said: tuple[Array, Array, Array], held: tuple[Array, Array, Array], solver: Solver) -> Array:
+        (here, force, wish), (there, pull, rho) = said, held
+        apart = jnp.abs(here - there).max(axis=1, initial=0.0) + jnp.abs(force - pull).max(axis=1, initial=0.0) / wish
+        return (apart > self.tolerance * solver.length) | (jnp.abs(wish - rho) > self.loose * rho)
+
+    def brief(self, message: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        return message
 
     def hear(self, state: AdmmState, message: tuple[Array, Array, Array], arrived: Array, solver: Solver) -> AdmmState:
         there, force, wish = message

@@ -33,6 +33,7 @@ from jax import Array
 
 from consat.protocols.base import Known, Solver
 from consat.protocols.local.interior import Gains, Interior, Mail, Memory
+from consat.protocols.sending import single
 
 
 class InteriorState(NamedTuple):
@@ -67,6 +68,8 @@ class InteriorPoint:
         drop: an agent comes down at once to the lowest level heard, if that is below by more than so many times its least slack.
         warm: rounds in which agents whose margins are below `far` at the start maximise the mean of these first, where all are quadratic.
         far: below minus this, in the team's unit of ψ.
+        tolerance: where agents send what is news, by which part of its largest number a quadratic may differ from what the neighbour holds;
+            levels may by μ, barriers by a factor of two, and a proof, while the level is below zero or without a cap, by this part, too.
         name: what ``--protocol`` calls it.
     """
 
@@ -80,6 +83,7 @@ class InteriorPoint:
     drop: float = 3.0
     warm: int = 1
     far: float = 0.0
+    tolerance: float = 0.3
     name: str = "interior-point"
     speaks: ClassVar[str] = "pair"
     per: ClassVar[Mapping[str, Any]] = {
@@ -102,6 +106,26 @@ class InteriorPoint:
     def speak(self, state: InteriorState, solver: Solver, round_: Array, known: Known) -> tuple[InteriorState, Mail]:
         memory, mail = _own(solver).round(state.memory, state.inbox, known.margin, self.gains)
         return InteriorState(memory, state.inbox), mail
+
+    def news(self, said: Mail, held: Mail, solver: Solver) -> Array:
+        def apart(new: Array, old: Array) -> Array:
+            axes = tuple(range(1, new.ndim))
+            return jnp.abs(new - old).max(axis=axes, initial=0.0) > self.tolerance * jnp.abs(new).max(axis=axes, initial=0.0)
+
+        barrier = jnp.maximum(said.barrier, 0.0)
+        differs = (said.changes != held.changes) | ((said.barrier < 0) != (held.barrier < 0))
+        differs |= apart(said.matrix, held.matrix) | apart(said.vector, held.vector)
+        differs |= (jnp.abs(said.level - held.level) > barrier) & (said.barrier >= 0)
+        differs |= (said.barrier > 2.0 * held.barrier) | (2.0 * said.barrier < held.barrier)
+        new, old = said.proof, held.proof
+        proves = ((new.weight < 0) != (old.weight < 0)) | apart(new.matrix, old.matrix) | apart(new.vector, old.vector)
+        proves |= (said.margin != held.margin) & ~(jnp.abs(said.margin - held.margin) <= EXACTLY)
+        return differs | (proves & (True if self.cap is None else said.level < 0))
+
+    def brief(self, message: Mail) -> Mail:
+        """Proofs stay as they are, since any rounding of theirs would have to be outward."""
+        numbers = (single(each) for each in (message.matrix, message.vector, message.barrier, message.level, message.margin))
+        return message._replace(**dict(zip(("matrix", "vector", "barrier", "level", "margin"), numbers, strict=True)))
 
     def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Solver) -> InteriorState:
         def take(new: Array, old: Array) -> Array:

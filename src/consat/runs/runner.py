@@ -22,6 +22,7 @@ from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Estimates, Layout
+from consat.protocols.sending import Sends
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
 from consat.runs.advice import around_loops
@@ -53,6 +54,7 @@ def run(
     obstacles: Sequence[Any] | None = None,
     wind: Sequence[float] = (),
     noise: float = 0.0,
+    sends: Sends = "all",
     auxiliary: float | None = None,
     restarts: int = 1,
     record: bool | None = None,
@@ -87,6 +89,7 @@ def run(
         obstacles: what `consat.disc` and its like return, which robots keep clear of; by default those of the scenario.
         wind: (d,) velocity of the air, m/s, for robots.
         noise: the most that a robot's measured position is wrong by, m.
+        sends: ``all``: every agent speaks in every round; ``events``: only when it has news, see `consat.protocols.sending`. In rounds.
         auxiliary: adds to every agent the constraint to stay within this radius of the team's middle (paper, remark 2), length.
         restarts: runs from so many starts, of this seed and those after it, as one computation, and tells of the one that ends with the
             largest margin. In rounds only.
@@ -110,7 +113,7 @@ def run(
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
-        wind=tuple(map(float, wind)), noise=noise, restarts=restarts,
+        wind=tuple(map(float, wind)), noise=noise, restarts=restarts, sends=sends,
         burst=None if burst is None else tuple(map(float, burst)),  # type: ignore[arg-type]
     )  # fmt: skip
     if checkpoint is not None and out is None:
@@ -178,13 +181,14 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
         found = best_start(team, settings, options)
         settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
         weather, more = options.weather(found["seed"]), more | {"restarts": found}
-    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
+    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, events=options.events, **pace._asdict(), **how))
 
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """What several processes can do."""
-    if options.restarts > 1 or options.robots is not None or options.burst is not None:
-        raise InvalidSettings("several processes run points, from one start, and lose messages one by one; use one process for more")
+    if options.restarts > 1 or options.robots is not None or options.burst is not None or options.events:
+        message = "several processes run points, from one start, lose messages one by one, and send all; use one process for more"
+        raise InvalidSettings(message)
     if kind in FLOWS or checkpoints:
         raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
     if team.moves:

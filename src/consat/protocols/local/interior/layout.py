@@ -113,6 +113,7 @@ class Plan:
         member: (M,) of each constraint, family after family.
         pair: (P,) of each end of a link.
         floats: (P,) how many numbers a message over each end holds.
+        singles: (P,) how many of them may be of 32 bits.
         width: variables that two neighbours share, at most.
         exact: whether what agents share travels along trees, so that nothing that one has said comes back to it through others, and no
             constraint moves: then what they tell adds up to a proof.
@@ -124,6 +125,7 @@ class Plan:
     member: Array
     pair: Array
     floats: Array
+    singles: Array
     width: int = field(metadata={"static": True})
     exact: bool = field(metadata={"static": True})
 
@@ -301,7 +303,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     floats = size * (size + 3) // 2 + 4 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        jnp.asarray(floats), int(size.max(initial=1)), shared.exact and not team.moves,
+        jnp.asarray(floats), jnp.asarray(size * (size + 3) // 2 + 3), int(size.max(initial=1)), shared.exact and not team.moves,
     )  # fmt: skip
 
 
