@@ -18,9 +18,8 @@ from consat.problem.graphs import hops
 from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team
 from consat.problem.units import Region, Scale
-from consat.protocols import InteriorPoint, Known, Rounds, agreement
+from consat.protocols import InteriorPoint, Known, Rounds, agreement, sending
 from consat.protocols.estimates import Estimates
-from consat.protocols import sending
 from consat.protocols.interior_point import EXACTLY, near
 from consat.protocols.local import proximal as prox
 from consat.protocols.local.interior import Interior
@@ -328,7 +327,7 @@ def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[
 
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     """The first half of a round."""
-    everyone, ends = world.everyone, world.everyone.links
+    everyone = world.everyone
     at = now.state.x if now.heard is None else now.heard.position
     known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
     state, message = protocol.speak(now.state, everyone, round_, known)
@@ -351,7 +350,10 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
             heard = _where_awake(_BODIES, world, awake, heard, now.heard)
     crossing, held, goes = Crossing(message, told, word), now.held, awake
     if held is not None:
-        crossing, held, goes = _sifted(protocol, world, crossing, held, awake)
+        talks = None if awake is None else _of_pairs(world, awake)
+        crossing, held, goes = sending.sifted(
+            protocol, everyone, crossing, held, world.pair, beat=float(sending.BEAT), lasting=not world.rough, talks=talks
+        )
     elif awake is not None:
         goes = _of_pairs(world, awake)
     reached = goes if through is None else through if goes is None else goes & through
@@ -364,27 +366,6 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
 def _of_pairs(world: World, agents: Array) -> Array:
     """(N,) → (pairs,): to each pair the value of the one who speaks."""
     return jax.ops.segment_max(agents[world.talker].astype(int), world.pair, world.pairs) > 0
-
-
-def _sifted(protocol: Rounds, world: World, said: Crossing, held: Held, awake: Array | None) -> tuple[Crossing, Held, Array]:
-    """What crosses, what is held from then on, and (pairs,) who sends."""
-    everyone = world.everyone
-    before = held.crossing if world.rough else sending.goes_on(held.crossing)
-    most, beat = (everyone.hops + 1.0, float(sending.BEAT)) if world.rough else (np.inf, np.inf)
-    link, pair = sending.news(protocol, everyone, said, before, held.place, most)
-    fresh = jax.ops.segment_max(link.astype(int), world.pair, world.pairs) > 0
-    fresh = fresh if pair is None else fresh | pair
-    goes, since = fresh | sending.due(held.since, beat), sending.passed(held.since, fresh, beat)
-    if awake is not None:
-        talks = _of_pairs(world, awake)
-        goes, since = goes & talks, jnp.where(talks, since, held.since)
-    message = protocol.brief(said.message)
-    of_message = goes if protocol.speaks == "pair" else goes[world.pair]
-    crossing = Crossing(
-        sending.chosen(of_message, message, before.message), *sending.chosen(goes[world.pair], said[1:], before[1:])
-    )  # fmt: skip
-    since = jnp.where(held.since >= agreement.NEVER, jnp.where(goes, 0.0, held.since), since)
-    return crossing, Held(crossing, since, None if said.word is None else said.word.position), goes
 
 
 def _sent(protocol: Rounds, world: World, crossing: Crossing, goes: Array | None) -> Sent:

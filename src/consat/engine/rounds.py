@@ -226,7 +226,8 @@ def simulate_rounds(
         earliest=protocol.earliest(engine.world.everyone),
         hopeless=hopeless, enough=enough, turn=None if turn is None else turn_after(engine.world),
     )  # fmt: skip
-    problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex, *["events"] * events)
+    how_run = (protocol, nu, size, first, weather, body, copies.layout, convex, *["events"] * events)
+    problem = "" if checkpoint is None else fingerprint(team, *how_run)
     course = _Course(team, engine, rules, choice, body, turn)
     if turn is not None and checkpoint is not None and checkpoint.turned:
         course.turn(np.zeros((turn.after.count, team.dimension)))

@@ -124,8 +124,10 @@ class InteriorPoint:
 
     def brief(self, message: Mail) -> Mail:
         """Proofs stay as they are, since any rounding of theirs would have to be outward."""
-        numbers = (single(each) for each in (message.matrix, message.vector, message.barrier, message.level, message.margin))
-        return message._replace(**dict(zip(("matrix", "vector", "barrier", "level", "margin"), numbers, strict=True)))
+        matrix, vector, barrier, level, margin = map(
+            single, (message.matrix, message.vector, message.barrier, message.level, message.margin)
+        )  # fmt: skip
+        return Mail(matrix, vector, barrier, level, margin, message.changes, message.proof)
 
     def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Solver) -> InteriorState:
         def take(new: Array, old: Array) -> Array:

@@ -61,17 +61,17 @@ class Held(NamedTuple):
     place: Array | None
 
 
-def due(since: Array, beat: float) -> Array:
-    """Who repeats itself; beat: see `BEAT`, ∞ where nothing gets lost."""
-    doubled = 2.0 ** jnp.arange(1.0, 16.0)
+def due(since: Array, beat: Any) -> Array:
+    """Who repeats itself, so many rounds after its last news; beat: see `BEAT`."""
+    doubled = jnp.array([2.0**k for k in range(1, 12)])
     soon = jnp.any((since[:, None] == doubled[None]) & (doubled[None] < beat), axis=1)
-    return (since >= NEVER) | ((soon | (since % beat == 0.0)) & jnp.isfinite(beat))
+    return (soon | (since % beat == 0.0)) & (since > 0)
 
 
-def passed(since: Array, goes: Array, beat: float) -> Array:
+def passed(since: Array, fresh: Array, beat: Any) -> Array:
     """Rounds since the last news, a round later."""
     later = since + 1.0
-    return jnp.where(goes, 0.0, jnp.where(later < NEVER, later, beat if beat < NEVER else 1.0))
+    return jnp.where(fresh, 1.0, jnp.where(later < NEVER, later, beat))
 
 
 def goes_on(crossing: Crossing) -> Crossing:
@@ -84,34 +84,59 @@ def _later(age: Array) -> Array:
     return jnp.where(age > 0, age + 1.0, age)
 
 
-def news(
-    protocol: Rounds, solver: Solver, said: Crossing, held: Crossing, place: Array | None, most: float
-) -> tuple[Array, Array | None]:
-    """Where what would be said differs from what is held by more than a tolerance.
+def sifted(
+    protocol: Rounds, solver: Solver, said: Crossing, held: Held, pair: Array, *, beat: Any, lasting: bool, talks: Array | None = None
+) -> tuple[Crossing, Held, Array]:
+    """What crosses, what is held from then on, and who sends.
 
     Args:
-        protocol: which says what its own messages may differ by.
-        solver: of the agents.
+        protocol: of the agents.
+        solver: theirs.
         said: what would be.
         held: by the neighbours.
-        place: see `Held`.
-        most: ages above it say no more than it does; +∞ where ages go on by themselves.
+        pair: (links,) to which neighbour each end leads.
+        beat: see `BEAT`; means nothing where nothing gets lost.
+        lasting: whether nothing gets lost, so that silence says that all is as before. Then what is held of the protocol does not hang on
+            what is said of bodies, and a run is the same wherever bodies are measured.
+        talks: (pairs,) whether whoever speaks there is awake; all are if None.
 
     Returns:
-        (links,), and (pairs,) of a protocol that speaks to pairs, else None.
+        the crossing and what is held, both with old rows where nothing is sent, and (pairs,).
     """
-    differs = protocol.news(said.message, held.message, solver)
-    pair = differs if protocol.speaks == "pair" else None
-    link = jnp.zeros(len(said.told), bool) if pair is not None else differs | _aged(said.told, held.told, most)
-    if said.word is not None and held.word is not None and place is not None:
-        away, step = (jnp.abs(said.word.position - other).max(axis=1, initial=0.0) for other in (held.word.position, place))
-        moved = away > jnp.maximum(PLACE * solver.length, LAG * step)
-        found = (held.word.stale >= NEVER) & (said.word.stale < NEVER)
-        link |= moved | found | _aged(said.word.age, held.word.age, most)
-    return link, pair
+    before = goes_on(held.crossing) if lasting else held.crossing
+    most = jnp.inf if lasting else solver.hops + 1.0
+    by_pair = protocol.speaks == "pair"
+    differs, first = protocol.news(said.message, before.message, solver), held.since >= NEVER
+    if not by_pair:
+        differs = _any(differs | _aged(said.told, before.told, most), pair, len(first))
+    differs |= first
+    bodies = first | _any(_moved(said, before, held.place, most, solver), pair, len(first))
+    goes, since = differs | bodies, passed(held.since, differs | bodies, beat)
+    if not lasting:
+        goes = differs = bodies = goes | due(held.since, beat)
+    if talks is not None:
+        goes, differs, bodies, since = goes & talks, differs & talks, bodies & talks, jnp.where(talks, since, held.since)
+    message = chosen(differs if by_pair else differs[pair], protocol.brief(said.message), before.message)
+    told, word = chosen(differs[pair], said.told, before.told), chosen(bodies[pair], said.word, before.word)
+    crossing = Crossing(message, told, word)
+    return crossing, Held(crossing, since, None if said.word is None else said.word.position), goes
 
 
-def _aged(said: Array, held: Array, most: float) -> Array:
+def _any(links: Array, pair: Array, pairs: int) -> Array:
+    return jax.ops.segment_max(links.astype(int), pair, pairs) > 0
+
+
+def _moved(said: Crossing, held: Crossing, place: Array | None, most: Any, solver: Solver) -> Array:
+    """(links,) whether there is news of a body, or of those that are where they should be."""
+    if said.word is None or held.word is None or place is None:
+        return jnp.zeros(len(said.told), bool)
+    away, step = (jnp.abs(said.word.position - other).max(axis=1, initial=0.0) for other in (held.word.position, place))
+    found = (held.word.stale >= NEVER) & (said.word.stale < NEVER)
+    return found | (away > jnp.maximum(PLACE * solver.length, LAG * step)) | _aged(said.word.age, held.word.age, most)
+
+
+def _aged(said: Array, held: Array, most: Any) -> Array:
+    """Where ages differ; above `most` they say no more than it does."""
     return jnp.minimum(said, most) != jnp.minimum(held, most)
 
 

@@ -177,11 +177,12 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
         options.require_flow(kind, team)
         return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=options.until, **how))
     pace, weather = options.pace(kind, team), options.weather(settings.start.seed)
+    how |= {"events": options.events}
     if options.restarts > 1:
         found = best_start(team, settings, options)
         settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
         weather, more = options.weather(found["seed"]), more | {"restarts": found}
-    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, events=options.events, **pace._asdict(), **how))
+    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
 
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:

@@ -454,7 +454,8 @@ class Session:
             margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin, estimate=None, integral=None,
             holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
             satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
-            floats_sent=tally.floats, bytes=tally.bytes, known=known_of(tally), known_from=None, seconds={"compile": 0.0, "run": 0.0}, period=period,
+            floats_sent=tally.floats, bytes=tally.bytes, known=known_of(tally), known_from=None,
+            seconds={"compile": 0.0, "run": 0.0}, period=period,
             bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
         )  # fmt: skip
         scenario = dataclasses.replace(scenario_of(team), name=self._name)

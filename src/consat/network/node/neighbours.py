@@ -97,8 +97,8 @@ class Peers:
                 accepted.append(message)
         return accepted
 
-    def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray]) -> None:
-        """Send a message."""
+    def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
+        """Send a message; single: see `Message`."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         peer.said = now
@@ -116,6 +116,7 @@ class Peers:
                 ack,
                 float(self._part.nu.beta),
                 tuple(arrays),
+                single,
             )
         )
         self._transport.send(neighbour, payload)

@@ -143,8 +143,8 @@ class Part:
         assert isinstance(smoothing.nu_beta, float)
         return Nu(smoothing.nu_alpha, smoothing.nu_beta)
 
-    def problem(self, mode: str) -> bytes:
-        """8 bytes that agree among agents of the same run, mode and common knowledge; nothing private is in them."""
+    def problem(self, mode: str, sends: str = "all") -> bytes:
+        """8 bytes that agree among agents of the same run, mode, way to send and common knowledge; nothing private is in them."""
         settings = self.settings.model_dump(mode="json", include={"protocol", "smoothing"})
         settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
@@ -152,7 +152,7 @@ class Part:
             "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "extent": self.extent, "convex": self.convex,
             "exact": self.exact,
             "settings": settings,
-        } | ({"generation": self.generation} if self.generation else {})  # fmt: skip
+        } | ({} if sends == "all" else {"sends": sends}) | ({"generation": self.generation} if self.generation else {})  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
 
     def without(self, gone: Collection[str]) -> Part:
