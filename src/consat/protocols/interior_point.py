@@ -113,12 +113,17 @@ class InteriorPoint:
             return jnp.abs(new - old).max(axis=axes, initial=0.0) > self.tolerance * jnp.abs(new).max(axis=axes, initial=0.0)
 
         barrier = jnp.maximum(said.barrier, 0.0)
-        differs = (said.changes != held.changes) | ((said.barrier < 0) != (held.barrier < 0))
+        differs = (said.barrier < 0) != (held.barrier < 0)
         differs |= apart(said.matrix, held.matrix) | apart(said.vector, held.vector)
         differs |= (jnp.abs(said.level - held.level) > barrier) & (said.barrier >= 0)
         differs |= (said.barrier > 2.0 * held.barrier) | (2.0 * said.barrier < held.barrier)
         new, old = said.proof, held.proof
-        proves = ((new.weight < 0) != (old.weight < 0)) | apart(new.matrix, old.matrix) | apart(new.vector, old.vector)
+        proves = (
+            (said.changes != held.changes)
+            | ((new.weight < 0) != (old.weight < 0))
+            | apart(new.matrix, old.matrix)
+            | apart(new.vector, old.vector)
+        )
         proves |= (said.margin != held.margin) & ~(jnp.abs(said.margin - held.margin) <= EXACTLY)
         return differs | (proves & (True if self.cap is None else said.level < 0))
 

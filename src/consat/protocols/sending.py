@@ -113,11 +113,11 @@ def sifted(
     bodies = first | _any(_moved(said, before, held.place, most, solver), pair, len(first))
     goes, since = differs | bodies, passed(held.since, differs | bodies, beat)
     if not lasting:
-        goes = differs = bodies = goes | due(held.since, beat)
+        goes = differs = goes | due(held.since, beat)
     if talks is not None:
-        goes, differs, bodies, since = goes & talks, differs & talks, bodies & talks, jnp.where(talks, since, held.since)
+        goes, differs, since = goes & talks, differs & talks, jnp.where(talks, since, held.since)
     message = chosen(differs if by_pair else differs[pair], protocol.brief(said.message), before.message)
-    told, word = chosen(differs[pair], said.told, before.told), chosen(bodies[pair], said.word, before.word)
+    told, word = chosen(differs[pair], said.told, before.told), chosen(goes[pair], said.word, before.word)
     crossing = Crossing(message, told, word)
     return crossing, Held(crossing, since, None if said.word is None else said.word.position), goes
 
