@@ -27,7 +27,7 @@ import struct
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Final, NamedTuple
@@ -109,7 +109,6 @@ class Message:
         ack: `sequence` of that message, 0 if none.
         nu_beta: ν_β that the sender uses.
         arrays: float64, vectors or matrices. As received they are read-only.
-        single: which of them are written in 32 bits.
     """
 
     kind: Kind
@@ -123,7 +122,6 @@ class Message:
     ack: int
     nu_beta: float
     arrays: tuple[np.ndarray, ...] = ()
-    single: tuple[int, ...] = ()
 
 
 class Numbers(NamedTuple):
@@ -146,10 +144,10 @@ Expected = Mapping[Kind, Sequence[Numbers | tuple[int, ...]]]
 """For each kind, its arrays; a kind that is missing is refused. A plain shape allows all finite numbers."""
 
 
-def encode(message: Message) -> bytes:
-    """The message as bytes."""
+def encode(message: Message, single: Container[int] = ()) -> bytes:
+    """The message as bytes; single: which of its arrays are written in 32 bits."""
     source, destination = _name(message.source), _name(message.destination)
-    arrays = [np.ascontiguousarray(array, dtype=_TYPES[k in message.single]) for k, array in enumerate(message.arrays)]
+    arrays = [np.ascontiguousarray(array, dtype=_TYPES[k in single]) for k, array in enumerate(message.arrays)]
     if len(message.problem) != 8 or len(arrays) > MOST_ARRAYS:
         raise NetworkError(
             f"a message must have a problem hash of 8 bytes and at most {MOST_ARRAYS} arrays, not {len(message.problem)} and {len(arrays)}"
@@ -163,7 +161,7 @@ def encode(message: Message) -> bytes:
     except struct.error as error:
         numbers = message.incarnation, message.sequence, message.ack
         raise NetworkError(f"incarnation, sequence and ack must be integers in 0 … 2⁶⁴ − 1, not {numbers}: {error}") from None
-    shapes = [_shape(array.shape, single=k in message.single) for k, array in enumerate(arrays)]
+    shapes = [_shape(array.shape, single=k in single) for k, array in enumerate(arrays)]
     body = b"".join((header, source, destination, *shapes, *(array.tobytes() for array in arrays)))
     if len(body) + _CHECKSUM.size > LONGEST:
         raise NetworkError(f"a message has {len(body)} bytes, but the longest allowed has {LONGEST}")
@@ -282,7 +280,6 @@ class Checker:
             return refused
         return Message(
             Kind(kind), problem, neighbour.name, self._me.decode(), incarnation, sequence, sent, echo, ack, nu_beta, layout.cut(numbers),
-            layout.single,
         )  # fmt: skip
 
 
@@ -332,10 +329,11 @@ class _Layout:
         """All numbers, from where they begin; a copy, aligned."""
         if not self.single:
             return np.frombuffer(payload, _TYPES[False], self.numbers, at).astype(float)
-        parts = []
+        parts = [np.zeros(0)]
         for k, (begin, end, _) in enumerate(self.slices):
             part = np.frombuffer(payload, _TYPES[k in self.single], end - begin, at)
-            parts.append(part.astype(float))
+            with np.errstate(invalid="ignore"):  # of signalling NaN, which is refused like any other
+                parts.append(part.astype(float))
             at += part.nbytes
         return np.concatenate(parts)
 

@@ -98,7 +98,7 @@ class Peers:
         return accepted
 
     def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
-        """Send a message; single: see `Message`."""
+        """Send a message; single: which arrays are written in 32 bits."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         peer.said = now
@@ -116,8 +116,8 @@ class Peers:
                 ack,
                 float(self._part.nu.beta),
                 tuple(arrays),
-                single,
-            )
+            ),
+            single,
         )
         self._transport.send(neighbour, payload)
         self.sent["messages"] += 1
