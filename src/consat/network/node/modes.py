@@ -27,8 +27,8 @@ Mode = Literal["interior-point", "admm", "link", "lockstep"]
 DEFAULT_MODE: Final = "interior-point"
 RATE: Final = {"interior-point": 100.0, "admm": 100.0, "link": 50.0}
 """Turns a second where nobody says, Hz."""
-HEARTBEAT: Final = 0.16
-"""An agent is silent for so long at most, s, so that its neighbours do not take it to be down."""
+HEARTBEAT: Final = 0.08
+"""An agent is silent for so long at most, s: six messages on end must be lost before a neighbour takes it to be down."""
 
 
 @dataclass(frozen=True)
