@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -66,6 +67,15 @@ def test_a_session_at_rest_is_silent_and_speaks_when_a_goal_moves() -> None:
     assert session.satisfied
     assert session.known == "satisfied"
     assert 0 < session.result().summary["messages"] - before - rest <= 0.2 * 50 * 22
+
+
+def test_a_run_goes_on_to_the_last_bit_from_a_checkpoint(tmp_path: Path) -> None:
+    how: Any = {"sends": "events", "loss": 0.2, "seed": 3}
+    whole = cs.run("case-c", rounds=40, **how)
+    cs.run("case-c", rounds=20, out=tmp_path, checkpoint=0, **how)
+    gone_on = cs.resume(tmp_path, rounds=40)
+    np.testing.assert_array_equal(gone_on.data["position"].values[-1], whole.data["position"].values[-1])
+    assert gone_on.summary["bytes"] == whole.summary["bytes"]
 
 
 def test_members_that_come_hear_from_everybody() -> None:

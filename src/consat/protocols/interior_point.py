@@ -69,7 +69,8 @@ class InteriorPoint:
         warm: rounds in which agents whose margins are below `far` at the start maximise the mean of these first, where all are quadratic.
         far: below minus this, in the team's unit of ψ.
         tolerance: where agents send what is news, by which part of its largest number a quadratic may differ from what the neighbour holds;
-            levels may by μ, barriers by a factor of two, and a proof, while the level is below zero or without a cap, by this part, too.
+            levels may by μ, barriers by a factor of two, and a proof, while the level is below `PROVES` or without a cap, by this part,
+            too.
         name: what ``--protocol`` calls it.
     """
 
@@ -125,7 +126,7 @@ class InteriorPoint:
             | apart(new.vector, old.vector)
         )
         proves |= (said.margin != held.margin) & ~(jnp.abs(said.margin - held.margin) <= EXACTLY)
-        return differs | (proves & (True if self.cap is None else said.level < 0))
+        return differs | (proves & (True if self.cap is None else said.level < PROVES))
 
     def brief(self, message: Mail) -> Mail:
         """Proofs stay as they are, since any rounding of theirs would have to be outward."""
@@ -151,6 +152,8 @@ def _own(solver: Solver) -> Interior:
     return solver.interior
 
 
+PROVES = 0.1
+"""In units of ψ: a team whose level is above is satisfied, or about to be, and asks for no proof that it cannot be."""
 NEARLY, EXACTLY = 0.05, 1e-3
 """Near the best is within this part of the bound, or within `EXACTLY` in units of ψ."""
 
