@@ -5,7 +5,7 @@
 Writes ``messages.md`` and ``messages.png``. A team has arrived from the round after the last one whose margin, at the agents' own positions, was
 below the goal: what interior-point asks for, 0.3 of the team's unit of ψ, or the best margin where that is less, less 1e-3 of the unit; for a
 torn team the best margin less 1e-3 of the unit; for a swarm, whose best margin nobody knows, 0. Bytes are those of the wire format without
-names of agents.
+names of agents and shapes of arrays.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ PROSE = """# Fewer messages
 Medians over {seeds} seeds, teams of {count} agents, {rounds} rounds without loss. A team has arrived from the round after the last one whose
 margin was below the goal: 0.3 of the team's unit of ψ, or the best margin where that is less, less 1e-3 of the unit; of a torn chain the best
 margin, less 1e-3; of a swarm 0. All know: every agent knows that all are satisfied, where a run ends. Bytes are those of the wire
-format, without names. At rest: messages in the last {rest} rounds, over those of a team that sends all.
+format, without names and shapes. At rest: messages in the last {rest} rounds, over those of a team that sends all.
 
 {table}
 

@@ -168,7 +168,7 @@ class Seen(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """What was sent in a round, in all: messages, numbers in them, and bytes of both, names of agents apart."""
+    """What was sent in a round, in all: messages, numbers in them, and bytes of both, names and shapes apart."""
 
     messages: Array
     floats: Array

@@ -30,7 +30,7 @@ LAG: Final = 10.0
 BEAT: Final = 16
 """Where messages get lost, an agent repeats itself 2, 4, 8, … rounds after its last news, and then whenever so many have passed."""
 HEADER: Final = 72
-"""Bytes of a message beside its numbers and the names in it; see `consat.network.wire`."""
+"""Bytes of a message beside its numbers, their shapes and the names in it; see `consat.network.wire`."""
 
 
 class Crossing(NamedTuple):

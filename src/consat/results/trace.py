@@ -35,7 +35,7 @@ class Trace:
         satisfied_from: the first step after the last one whose margin was ≤ 0; None if the last margin is.
         messages: sent in all; None in continuous time.
         floats_sent: likewise.
-        bytes: of all messages, headers and all, names of agents apart; None in continuous time.
+        bytes: of all messages, headers and all, names of agents and shapes of arrays apart; None in continuous time.
         known: what every agent knows at the end: that all are ``satisfied``, that the team is ``infeasible``, or nothing.
         known_from: the round since when, or the time, s, where agents take turns in time; None in continuous time, or if they know nothing.
         seconds: spent on ``compile`` and ``run``.
