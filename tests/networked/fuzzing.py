@@ -28,10 +28,13 @@ INF = math.inf
 LETTER = Letter(names=(("x", 0), None), level=True)
 """Mail of the interior-point protocol about one coordinate and the level: count, μ, t and the least margin, then L11, L12, L22, e1, e2; and
 Σλ, c, the error, L11 and e1 of the proof."""
+QUADRATIC = 8
+"""Numbers of its half of 32 bits, see `consat.network.node.pairs.halves`."""
 EXPECTED: dict[str, dict[Kind, list[Any]]] = {
     "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)], Kind.RESEND: [(1, 2), LETTER.numbers()]},
     "carol": {Kind.STATE: [Numbers((2, 6), (9.0, 9.0, INF, 100.0, 100.0, 1e6))]},  # as of estimates, a margin, a body, and its age
-    "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)]},
+    "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)], Kind.SAME: [(1,)]},
+    "dave": {Kind.STATE: [(1, 2), *LETTER.brief()], Kind.SAME: [Numbers((3,), 100.0, single=True)]},
 }
 WINDOW = {Reason.DUPLICATE, Reason.STALE, Reason.JUMP}
 INTERESTING = (0, 1, 2, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
@@ -83,7 +86,7 @@ def _double(data: bytes) -> float:
 
 def second_opinion(payload: bytes) -> Read | None:
     """What the message says, or None if it must not be accepted, whatever came before."""
-    if len(payload) < 72 or payload[:5] != b"csat\x03" or payload[7] or payload[8:16] != PROBLEM:
+    if len(payload) < 72 or payload[:5] != b"csat\x04" or payload[7] or payload[8:16] != PROBLEM:
         return None
     if crc(payload[:-4]) != _integer(payload[-4:]):
         return None
@@ -106,20 +109,41 @@ def _arrays(data: bytes, count: int, expected: list[Any]) -> list[tuple[tuple[in
     wanted = [each if isinstance(each, Numbers) else Numbers(each) for each in expected]
     sizes = [math.prod(array.shape) for array in wanted]
     told = [data[9 * place : 9 * place + 9] for place in range(count)]
-    due = [bytes([len(array.shape)]) + b"".join(n.to_bytes(4, "little") for n in (*array.shape, 0)[:2]) for array in wanted]
-    if told != due or len(data) != 9 * count + 8 * sum(sizes):
+    due = [
+        bytes([len(array.shape) + 4 * array.single]) + b"".join(n.to_bytes(4, "little") for n in (*array.shape, 0)[:2]) for array in wanted
+    ]
+    widths = [4 if array.single else 8 for array in wanted for _ in range(math.prod(array.shape))]
+    if told != due or len(data) != 9 * count + sum(widths):
         return None
-    values = [_double(data[at : at + 8]) for at in range(9 * count, len(data), 8)]
+    values, at = [], 9 * count
+    for width in widths:
+        values.append(_double(data[at : at + 8]) if width == 8 else _float(data[at : at + 4]))
+        at += width
     arrays = []
     for array, size in zip(wanted, sizes, strict=True):
         limits = array.largest if isinstance(array.largest, tuple) else (array.largest,)
         if not all(abs(value) <= limits[place % len(limits)] for place, value in enumerate(values[:size])):
             return None
-        if array.sound and not makes_sense(values[:size]):
+        if array.sound and not makes_sense(in_full(values[:size])):
             return None
         arrays.append((array.shape, values[:size]))
         del values[:size]
     return arrays
+
+
+def _float(data: bytes) -> float:
+    bits = _integer(data)
+    sign, exponent, fraction = (-1.0 if bits >> 31 else 1.0), bits >> 23 & 255, bits & (1 << 23) - 1
+    if exponent == 255:
+        return math.nan if fraction else sign * INF
+    return sign * (math.ldexp(fraction, -149) if exponent == 0 else math.ldexp(fraction + (1 << 23), exponent - 150))
+
+
+def in_full(numbers: list[float]) -> list[float]:
+    """Mail as in `LETTER`: a half of it with another that makes sense."""
+    if len(numbers) == QUADRATIC:
+        return [0.0, *numbers, 0.0, 0.0, 0.0, 0.0, 0.0]
+    return numbers if len(numbers) > QUADRATIC else [numbers[0], *[0.0] * QUADRATIC, *numbers[1:]]
 
 
 def makes_sense(numbers: list[float]) -> bool:
@@ -167,18 +191,21 @@ class Mutator:
         arrays = tuple(self._array(each if isinstance(each, Numbers) else Numbers(each)) for each in EXPECTED[source][kind])
         self.sequence += 1
         echo = draw.choice([math.nan, 12.5])
+        single = tuple(k for k, each in enumerate(EXPECTED[source][kind]) if isinstance(each, Numbers) and each.single)
         message = Message(kind, PROBLEM, source, ME, 1, self.sequence, draw.uniform(0, 99), echo, self.sequence, 5.0, arrays)
-        self.last = encode(message)
+        self.last = encode(message, single)
         return self.last
 
     def _array(self, expected: Numbers) -> np.ndarray:
         draw = self.random
-        values = [draw.uniform(-9, 9) for _ in range(math.prod(expected.shape))]
+        size = math.prod(expected.shape)
+        values = [draw.uniform(-9, 9) for _ in range(14 if expected.sound else size)]
         if expected.sound:
             root, side = draw.uniform(0, 3), draw.uniform(-3, 3)
             values[0], values[1] = float(draw.randrange(5)), draw.choice([-1.0, draw.uniform(0, 9)])
             values[4:7] = root * root, root * side, side * side + draw.choice([0.0, 1.0])
             values[9], values[11:13] = draw.choice([-1.0, 0.0, 2.5]), (draw.uniform(0, 1), draw.uniform(0, 9))
+            values = {14: values, QUADRATIC: values[1:9], 6: [values[0], *values[9:]]}[size]
         return np.asarray(values).reshape(expected.shape)
 
     def astray(self) -> bytes:

@@ -17,6 +17,7 @@ from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import Manner
 from consat.network.node.part import split
 from consat.network.transports.memory import Air, Conditions
+from consat.protocols.sending import Sends
 from consat.scenario import load
 
 ROUNDS = 120
@@ -28,15 +29,20 @@ TRIALS = {
     "admm": ("case-c", "admm", 0.3, KILLS),
 }  # fmt: skip
 """Scenario, protocol, loss, and who is killed when."""
+EVENTS = {
+    "events": ("case-c", "interior-point", 0.0, ()), "events, kills": ("case-c", "interior-point", 0.3, KILLS),
+    "events, infeasible": ("case-d", "max-min", 0.3, ()), "events, admm": ("case-c", "admm", 0.3, KILLS),
+}  # fmt: skip
+"""The same where agents send only what is news."""
 
 
 def trajectories(
-    name: str, protocol: str, loss: float, kills: tuple[tuple[float, str], ...], folder: Path
+    name: str, protocol: str, loss: float, kills: tuple[tuple[float, str], ...], sends: Sends, folder: Path
 ) -> dict[str, dict[int, list[float]]]:
     """Of all agents by round, over the network in memory; those to be killed start again half a second later."""
     parts = split(load(name, [f"protocol.kind={protocol}"]), run="oracle")
     conditions = Conditions(loss=loss, delay=(1e-4, 3e-3), repeat=0.1)
-    team = Rehearsal(parts, Manner("lockstep", turns=ROUNDS, report=0.0), Air(conditions))
+    team = Rehearsal(parts, Manner("lockstep", turns=ROUNDS, report=0.0, sends=sends), Air(conditions))
     for agent in ("a1", "a2", "a3"):  # one after the other, as processes do
         team.start(agent, memory=folder / agent)
         team.run(0.02)
@@ -55,15 +61,16 @@ def trajectories(
 
 def main() -> None:
     truth, ids, found = None, None, {}
-    for trial, (name, protocol, loss, kills) in TRIALS.items():
-        result = cs.run(name, rounds=ROUNDS, protocol=protocol)
+    for trial, (name, protocol, loss, kills) in (TRIALS | EVENTS).items():
+        sends: Sends = "events" if trial in EVENTS else "all"
+        result = cs.run(name, rounds=ROUNDS, protocol=protocol, sends=sends)
         positions, agents = result.data["position"].values, list(result.data["agent"].values)
         if truth is None:
             truth, ids = positions, agents
         if "truth" in sys.argv:
             break
         with tempfile.TemporaryDirectory() as folder:
-            tracks = trajectories(name, protocol, loss, kills, Path(folder))
+            tracks = trajectories(name, protocol, loss, kills, sends, Path(folder))
         off = [np.abs(positions[number, agents.index(agent)] - place).max() for agent in agents for number, place in tracks[agent].items()]
         found[trial] = {"rounds": [len(tracks[agent]) for agent in agents], "off": float(max(off))}
     json.dump({"truth": None if truth is None else truth.tolist(), "ids": ids, "found": found}, sys.stdout)

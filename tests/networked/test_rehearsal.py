@@ -23,7 +23,7 @@ from consat.network.transports.memory import Air, Conditions
 from consat.numerics import float64
 from consat.scenario import loads
 from tests.networked.case_c import ADMM, events, off, parts, rehearse
-from tests.networked.oracle import TRIALS
+from tests.networked.oracle import EVENTS, TRIALS
 
 ROOT = Path(__file__).parents[2]
 DELAYS = (0.05, 0.2)
@@ -51,11 +51,11 @@ def test_lockstep_equals_simulate_bit_for_bit() -> None:
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
     }
     done = subprocess.run(
-        [sys.executable, "-m", "tests.networked.oracle"], cwd=ROOT, env=environment, capture_output=True, check=False, timeout=300
+        [sys.executable, "-m", "tests.networked.oracle"], cwd=ROOT, env=environment, capture_output=True, check=False, timeout=500
     )
     assert done.returncode == 0, done.stderr.decode()[-2000:]
     found = json.loads(done.stdout)["found"]
-    assert found == {name: {"rounds": [120, 120, 120], "off": 0.0} for name in TRIALS}
+    assert found == {name: {"rounds": [120, 120, 120], "off": 0.0} for name in TRIALS | EVENTS}
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from consat.errors import NetworkError
 from consat.network.wire import AHEAD, LONGEST, QUIET, SUPPORT, Checker, Kind, Message, Numbers, Reason, claims, encode
+from consat.protocols.sending import HEADER
 
 PROBLEM = b"problem1"
 EXPECTED = {
@@ -48,16 +49,19 @@ def checker(expected: Mapping[str, Any] = EXPECTED, **options: Any) -> Checker:
 def test_bytes_are_as_documented() -> None:
     """Written down by hand: whoever changes the format must change the version."""
     body = (
-        b"csat\x03\x02\x02\x00problem1"
+        b"csat\x04\x02\x03\x00problem1"
         + struct.pack("<QQQ", 3, 2**40, 9)
         + struct.pack("<ddd", 1.5, 0.25, 5.0)
         + b"\x02\x00\x03\x00a1\xc3\xa4x"
         + b"\x01\x02\x00\x00\x00\x00\x00\x00\x00"
         + b"\x02\x02\x00\x00\x00\x01\x00\x00\x00"
+        + b"\x05\x01\x00\x00\x00\x00\x00\x00\x00"
         + struct.pack("<dddd", 1.0, 2.0, 3.0, 4.0)
+        + struct.pack("<f", 0.1)
     )
-    told = Message(Kind.STATE, PROBLEM, "a1", "äx", 3, 2**40, 1.5, 0.25, 9, 5.0, (np.array([1.0, 2.0]), np.array([[3.0], [4.0]])))
-    assert encode(told) == body + struct.pack("<I", zlib.crc32(body))
+    arrays = np.array([1.0, 2.0]), np.array([[3.0], [4.0]]), np.array([0.1])
+    told = Message(Kind.STATE, PROBLEM, "a1", "äx", 3, 2**40, 1.5, 0.25, 9, 5.0, arrays)
+    assert encode(told, single=(2,)) == body + struct.pack("<I", zlib.crc32(body))
 
 
 @given(
@@ -102,6 +106,29 @@ def test_other_dtypes_and_orders_are_written_as_float64_row_by_row() -> None:
     assert got.arrays[1].tolist() == [1, 2]
 
 
+@pytest.mark.parametrize("value", [0.1, -3.4e38, 1e-45, math.inf])
+def test_numbers_of_32_bits_arrive_rounded_and_are_checked_like_others(value: float) -> None:
+    due = Numbers((2,), (math.inf, 10.0), sound=lambda numbers: bool(numbers[1] >= 0), single=True)
+    door = Checker("a2", {"a1": {Kind.STATE: [(1,), due, (1,)]}}, PROBLEM)
+
+    def sent(second: float, sequence: int) -> Message | None:
+        arrays = np.array([0.1]), np.array([value, second]), np.array([0.3])
+        return door.accept(encode(message(arrays=arrays, sequence=sequence), single=(1,)))
+
+    got = sent(1.0, 1)
+    assert got is not None
+    assert [array.tolist() for array in got.arrays] == [[0.1], [float(np.float32(value)), 1.0], [0.3]]
+    assert all(array.dtype == np.float64 for array in got.arrays)
+    assert sent(-1.0, 2) is sent(11.0, 3) is sent(math.nan, 4) is None
+    assert door.counts == {Reason.SENSE: 1, Reason.NUMBER: 2}
+    assert door.accept(encode(message(arrays=(np.zeros(1), np.zeros(2), np.zeros(1)), sequence=5))) is None, "64 bits where 32 are due"
+
+
+def test_the_engine_counts_the_bytes_of_a_message_as_they_are() -> None:
+    both = len(encode(message(arrays=()))) - len(b"a1a2")
+    assert both == HEADER
+
+
 def sealed(body: bytes) -> bytes:
     return body + struct.pack("<I", zlib.crc32(body))
 
@@ -119,7 +146,9 @@ BAD = {
     "another program's": (patched(0, b"JSON"), Reason.MAGIC),
     "version 1, which told nothing of bodies": (patched(4, b"\x01"), Reason.VERSION),
     "version 2, which told nothing to a neighbour as a whole": (patched(4, b"\x02"), Reason.VERSION),
-    "version 4": (patched(4, b"\x04"), Reason.VERSION),
+    "version 3, whose numbers were all of 64 bits": (patched(4, b"\x03"), Reason.VERSION),
+    "version 5": (patched(4, b"\x05"), Reason.VERSION),
+    "numbers of 32 bits where 64 are due": (encode(message(), single=(0,)), Reason.SHAPE),
     "a flipped bit": (encode(message())[:-5] + b"\x41" + encode(message())[-4:], Reason.CHECKSUM),
     "a reserved byte": (patched(7, b"\x01"), Reason.HEADER),
     "a stranger": (encode(message(source="a9")), Reason.SOURCE),

@@ -36,6 +36,7 @@ from consat.cli.terminal import (
     located,
     out_option,
     scenario_argument,
+    sends_option,
     set_option,
     tell,
 )
@@ -153,6 +154,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--wind", callback=_numbers, metavar="VX,VY", help="Velocity of the air, m/s, for robots.")
 @click.option("--noise", type=click.FloatRange(min=0), default=0.0, metavar="M", help="What a robot's position is measured wrong by, m.")
 @click.option("--simulator", metavar="NAME", help="Integrates the bodies of robots: mujoco; by default the robots' own models do.")
+@sends_option
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @click.option("--restarts", type=click.IntRange(min=1), default=1, metavar="K", help="Run from K starts, and tell of the best.")
 @out_option

@@ -18,6 +18,7 @@ from consat.cli.terminal import (
     located,
     out_option,
     scenario_argument,
+    sends_option,
     set_option,
     tell,
 )
@@ -143,6 +144,7 @@ def split(
 @mode_option
 @rate_option
 @pace_option
+@sends_option
 @speed_option
 @click.option("--sensor", type=click.Choice(["simulated", "stdin"]), default="simulated", show_default=True, help="Whence positions come.")
 @click.option(
@@ -167,7 +169,7 @@ def split(
 @port_option
 def agent(
     *, scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
-    rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, **around: Any,
+    rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, sends: Any, **around: Any,
 ) -> int:  # fmt: skip
     """Run one agent, as on its own robot.
 
@@ -181,7 +183,7 @@ def agent(
     speed = around.pop("speed")
     part = _part(scenario, agent, overrides, port, mode)
     manner = Manner(
-        mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report
+        mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report, sends
     )
     if around["robot"] is not None and around["sensor"] != "stdin":
         raise click.UsageError("--robot is commanded by what --sensor stdin measures; a simulated body is a point")
@@ -204,6 +206,7 @@ def agent(
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts, loss and delay; overrides start.seed.")
 @rate_option
 @pace_option
+@sends_option
 @speed_option
 @loss_option
 @delay_option

@@ -24,6 +24,9 @@ set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VAL
 estimates_option = click.option(
     "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."
 )
+sends_option = click.option(
+    "--sends", type=click.Choice(["all", "events"]), default="all", help="In every round, or only what is news to a neighbour."
+)
 out_option = click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there."
 )

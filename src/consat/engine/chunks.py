@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from consat.engine.recording import Choice
-from consat.engine.round import SATISFIED, Now, Seen, World, begin, one_round, see
+from consat.engine.round import SATISFIED, Now, Seen, Sent, World, begin, one_round, see
 from consat.engine.violations import violated
 from consat.numerics import on_device, quick_compilation, thorough_compilation
 from consat.protocols import Rounds
@@ -29,7 +29,7 @@ SURE = 3
 """Number of consecutive rounds for which all agents must know the result that ends a run, because received margins are some rounds old."""
 NEVER = 2**62
 """A number of rounds that is never reached."""
-SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats")
+SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats", "bytes")
 """Fields of `Seen` that every chunk reports for each round."""
 
 
@@ -61,6 +61,7 @@ class Chunk(NamedTuple):
         near: () number of consecutive rounds for which all agents have known the result that ends the run.
         messages: (CHUNK,) number of messages sent.
         floats: (CHUNK,) number of floats sent.
+        bytes: (CHUNK,) number of bytes sent.
         drift: () largest distance of a position, on any axis, from its value before the chunk; not finite if a position is not.
         violated: (W,) number of rounds after which each watched constraint was violated; None if not counted.
         kept: the recorded rounds, with a leading axis; entries beyond their number are meaningless.
@@ -74,6 +75,7 @@ class Chunk(NamedTuple):
     near: Any
     messages: Any
     floats: Any
+    bytes: Any
     drift: Any
     violated: Any
     kept: Kept
@@ -212,6 +214,7 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         near=ask.near,
         messages=jnp.zeros(CHUNK, whole),
         floats=jnp.zeros(CHUNK, whole),
+        bytes=jnp.zeros(CHUNK, whole),
         drift=jnp.zeros((), real),
         violated=jnp.zeros(len(chosen.watched), whole),
         kept=Kept(
@@ -259,7 +262,7 @@ def _one(protocol: Rounds, world: World, chosen: Chosen, now: Now, number: Array
 
 def _look(world: World, chosen: Chosen, now: Now, number: Array) -> Kept:
     nothing = jnp.asarray(0)
-    return chosen.of_seen(see(world.at(number), now, (nothing, nothing), (nothing, nothing)))
+    return chosen.of_seen(see(world.at(number), now, (nothing, nothing), Sent(nothing, nothing, nothing)))
 
 
 @functools.cache

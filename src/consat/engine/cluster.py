@@ -25,6 +25,7 @@ from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
+from consat.protocols.sending import HEADER
 
 PATIENCE = 600
 """Largest time, in s, that processes wait for one another to compile."""
@@ -179,6 +180,7 @@ class ManyProcesses:
             near=0,
             messages=messages.sum(axis=0).astype(np.int64),
             floats=floats.sum(axis=0).astype(np.int64),
+            bytes=(HEADER * messages + 8 * floats).sum(axis=0).astype(np.int64),
             drift=drift[:, :count].max(),
             violated=None,
             kept=Kept(people[..., :d], people[..., d], rows, np.zeros((len(people), 0))),
@@ -319,7 +321,7 @@ def _compiled() -> _Programs:
         packed = _packed(spoken).at[into.reshape(-1)].set(came.reshape(-1, came.shape[-1]), mode="drop")
         now, (known, _) = hear(protocol, world, _with(spoken, packed))
         book, rows, place = noted
-        counts = {"known": known, "messages": spoken.messages, "floats": spoken.floats}
+        counts = {"known": known, "messages": spoken.sent.messages, "floats": spoken.sent.floats}
         book = book._replace(**{name: getattr(book, name).at[place].set(value.astype(float)) for name, value in counts.items()})
         return now, note(book, now, rows, place)
 

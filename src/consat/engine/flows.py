@@ -384,6 +384,7 @@ class _Course:
             "satisfied_from": self.tally.satisfied_from,
             "messages": None,
             "floats_sent": None,
+            "bytes": None,
             "known": None,
             "known_from": None,
             "violated": shares(self.team, self.tally.violated, self.tally.done + 1),

@@ -18,11 +18,12 @@ from consat.problem.graphs import hops
 from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team
 from consat.problem.units import Region, Scale
-from consat.protocols import InteriorPoint, Known, Rounds, agreement
+from consat.protocols import InteriorPoint, Known, Rounds, agreement, sending
 from consat.protocols.estimates import Estimates
 from consat.protocols.interior_point import EXACTLY, near
 from consat.protocols.local import proximal as prox
 from consat.protocols.local.interior import Interior
+from consat.protocols.sending import HEADER, Crossing, Held
 from consat.protocols.solver import EXACT, LocalSolver
 
 if TYPE_CHECKING:
@@ -163,6 +164,15 @@ class Seen(NamedTuple):
     bound: Any
     messages: Any
     floats: Any
+    bytes: Any
+
+
+class Sent(NamedTuple):
+    """What was sent in a round, in all: messages, numbers in them, and bytes of both, names and shapes apart."""
+
+    messages: Array
+    floats: Array
+    bytes: Array
 
 
 @jax.tree_util.register_dataclass
@@ -208,6 +218,7 @@ class World:
         wind: (d,) velocity of the air, m/s; None where it is still.
         noise: the most that a measured position is wrong by, m; None where they are exact.
         burst: (2,) see `Weather`; None without.
+        events: whether agents send only what is news, see `consat.protocols.sending`.
     """
 
     everyone: Everyone
@@ -227,6 +238,7 @@ class World:
     noise: Array | None = None
     burst: Array | None = None
     drive: Drive | None = field(default=None, metadata={"static": True})
+    events: bool = field(default=False, metadata={"static": True})
 
     def at(self, round_: Array) -> World:
         """With the constraints as they are after so many rounds."""
@@ -261,6 +273,7 @@ class Now(NamedTuple):
         heard: what they know of each other's bodies; None where bodies can jump.
         robots: what bodies are; None where they are points.
         bad: (pairs,) between whom nothing gets through for now; None where losses do not come in bursts.
+        held: what neighbours hold of what they said; None where everything is sent.
     """
 
     state: Any
@@ -270,6 +283,7 @@ class Now(NamedTuple):
     heard: agreement.Bodies | None = None
     robots: Driven | None = None
     bad: Array | None = None
+    held: Held | None = None
 
 
 class Spoken(NamedTuple):
@@ -280,57 +294,49 @@ class Spoken(NamedTuple):
         ages: likewise.
         body: (N, d) likewise.
         heard: likewise.
-        crossing: what stands at each end, on its way to the other: the protocol's message, the ages, (E,), and word of bodies, if any.
+        crossing: what stands at each end, on its way to the other.
         went: (E,) whether it was sent and not lost; None where nothing is.
         reached: (P,) the same of the message to each neighbour; None where nobody asks.
         key: of the random draws that follow.
-        messages: sent.
-        floats: sent.
+        sent: how much.
         robots: likewise.
         bad: likewise.
+        held: likewise.
     """
 
     state: Any
     ages: agreement.Ages
     body: Array
     heard: agreement.Bodies | None
-    crossing: tuple[Any, Array, agreement.Word | None]
+    crossing: Crossing
     went: Array | None
     reached: Array | None
     key: Array
-    messages: Array
-    floats: Array
+    sent: Sent
     robots: Driven | None = None
     bad: Array | None = None
+    held: Held | None = None
 
 
 def one_round(protocol: Rounds, world: World, now: Now, round_: Array) -> tuple[Now, Seen]:
     """What all agents do in one round."""
     spoken = speak(protocol, world, now, round_)
     now, known = hear(protocol, world, spoken)
-    return now, see(world, now, known, (spoken.messages, spoken.floats))
+    return now, see(world, now, known, spoken.sent)
 
 
 def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     """The first half of a round."""
-    everyone, ends = world.everyone, world.everyone.links
+    everyone = world.everyone
     at = now.state.x if now.heard is None else now.heard.position
     known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
     state, message = protocol.speak(now.state, everyone, round_, known)
     ages, told = agreement.speak(now.ages, state.x, everyone)
-    key, went, awake, reached, bad = now.key, None, None, None, now.bad
-    sent, copies_sent = jnp.asarray(world.pairs), jnp.asarray(len(ends))
-    counted = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
+    key, awake, through, bad = now.key, None, None, now.bad
     if world.rough:
         key, awake, through, bad = _luck(world, now.key, now.bad)
         state = _where_awake(protocol.per, world, awake, state, now.state)
         ages = _where_awake(_AGES, world, awake, ages, now.ages)
-        goes = awake[world.talker]
-        went, reached = goes & through[world.pair], through
-        counted = goes if counted is None else goes & counted
-    if counted is not None:
-        sent = jnp.sum(jax.ops.segment_max(counted.astype(int), world.pair, world.pairs))
-        copies_sent = jnp.sum(counted)
     targets = pick(state.x, world.own)
     if now.robots is None or world.drive is None:
         body, robots = _moved(now.body, targets, world.reach), None
@@ -342,13 +348,46 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
         if awake is not None:
             heard = _where_awake(_BODIES, world, awake, heard, now.heard)
-    per_copy = jax.tree.leaves((message if protocol.speaks == "link" else (), () if word is None else (word.position, word.stale)))
-    floats = (sent if word is None else 2 * sent) + copies_sent * sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
+    crossing, held, goes = Crossing(message, told, word), now.held, awake
+    if held is not None:
+        talks = None if awake is None else _of_pairs(world, awake)
+        crossing, held, goes = sending.sifted(
+            protocol, everyone, crossing, held, world.pair, beat=float(sending.BEAT), lasting=not world.rough, talks=talks
+        )
+    elif awake is not None:
+        goes = _of_pairs(world, awake)
+    reached = goes if through is None else through if goes is None else goes & through
+    if through is None:  # silence, where nothing gets lost, says that all is as before
+        reached = jnp.ones(world.pairs, bool) if protocol.speaks == "pair" else None
+    went = None if through is None or reached is None else reached[world.pair]
+    return Spoken(state, ages, body, heard, crossing, went, reached, key, _sent(protocol, world, crossing, goes), robots, bad, held)
+
+
+def _of_pairs(world: World, agents: Array) -> Array:
+    """(N,) → (pairs,): to each pair the value of the one who speaks."""
+    return jax.ops.segment_max(agents[world.talker].astype(int), world.pair, world.pairs) > 0
+
+
+def _sent(protocol: Rounds, world: World, crossing: Crossing, goes: Array | None) -> Sent:
+    """How much was sent, where it went, (pairs,); everywhere if None."""
+    everyone, ends, word = world.everyone, world.everyone.links, crossing.word
+    per_copy = jax.tree.leaves((crossing.message if protocol.speaks == "link" else (), () if word is None else (word.position, word.stale)))
+    width = sum(leaf.size // max(len(ends), 1) for leaf in per_copy)
+    ours = None if world.part is None else world.part.ours[world.talker]  # the others' messages are counted where they are sent
+    if goes is None and ours is None:
+        messages, copies = jnp.asarray(world.pairs), jnp.asarray(len(ends))
+    else:
+        went = jnp.ones(len(ends), bool) if goes is None else goes[world.pair]
+        went = went if ours is None else went & ours
+        messages = jnp.sum(jax.ops.segment_max(went.astype(int), world.pair, world.pairs))
+        copies = jnp.sum(went)
+    floats, less = (messages if word is None else 2 * messages) + copies * width, jnp.asarray(0)
     if protocol.speaks == "pair" and everyone.interior is not None:
-        talks = jnp.ones(world.pairs, bool) if awake is None else awake[everyone.interior.talker]
-        reached = talks if reached is None else talks & reached
-        floats += jnp.sum(jnp.where(talks, everyone.interior.plan.floats, 0))
-    return Spoken(state, ages, body, heard, (message, told, word), went, reached, key, sent, floats, robots, bad)
+        plan = everyone.interior.plan
+        talks = jnp.ones(world.pairs, bool) if goes is None else goes
+        floats += jnp.sum(jnp.where(talks, plan.floats, 0))
+        less = jnp.sum(jnp.where(talks, plan.singles, 0)) if world.events else less
+    return Sent(messages, floats, HEADER * messages + 8 * floats - 4 * less)
 
 
 _AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
@@ -387,7 +426,7 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Arr
     if heard is not None and word is not None and world.owners is not None:
         heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
     known = agreement.known(ages if heard is None else heard.ages, everyone) > 0
-    now = Now(state, ages, spoken.body, spoken.key, heard, spoken.robots, spoken.bad)
+    now = Now(state, ages, spoken.body, spoken.key, heard, spoken.robots, spoken.bad, spoken.held)
     return now, knowledge(protocol, world, now, known if world.part is None else known | ~world.part.ours)
 
 
@@ -441,8 +480,8 @@ def _driven(world: World, drive: Drive, robots: Driven, targets: Array, key: Arr
     return Driven(state, memory, robots.paths)
 
 
-def see(world: World, now: Now, known: tuple[Array, Array], sent: tuple[Array, Array]) -> Seen:
-    """What an observer sees; known: see `knowledge`; sent: messages and floats."""
+def see(world: World, now: Now, known: tuple[Array, Array], sent: Sent) -> Seen:
+    """What an observer sees; known: see `knowledge`."""
     margins = world.observer.agent_margins(now.body)
     smooth = world.observer.smooth_margin(now.body, world.everyone.nu)
     turns = now.robots is not None and world.drive is not None
@@ -487,8 +526,28 @@ def begin(protocol: Rounds, world: World, first: Array, key: Array) -> tuple[Now
         robots = Driven(state, world.drive.start(state), paths)
     bad = None if world.burst is None else jnp.zeros(world.pairs, bool)
     now = Now(protocol.start(first, world.everyone), agreement.start(first, world.everyone), start, key, heard, robots, bad)
-    seen = see(world, now, (jnp.asarray(0), jnp.asarray(jnp.nan)), (jnp.asarray(0), jnp.asarray(0)))
+    if world.events:
+        now = now._replace(held=_nothing_held(protocol, world, now))
+    nothing = jnp.asarray(0)
+    seen = see(world, now, (nothing, jnp.asarray(jnp.nan)), Sent(nothing, nothing, nothing))
     return now, seen._replace(estimate=first)  # a protocol may begin from others
+
+
+def _nothing_held(protocol: Rounds, world: World, now: Now) -> Held:
+    """Before anything was said."""
+
+    def said() -> Crossing:
+        everyone = world.everyone
+        known = Known(jnp.zeros(everyone.agents), jnp.zeros(everyone.agents))
+        _, message = protocol.speak(now.state, everyone, jnp.asarray(0.0), known)
+        word = None
+        if now.heard is not None and world.owners is not None:
+            _, word = agreement.speak_bodies(now.heard, now.body, world.owners, everyone)
+        return Crossing(message, agreement.speak(now.ages, now.state.x, everyone)[1], word)
+
+    crossing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(said))
+    word: agreement.Word | None = crossing.word
+    return Held(crossing, jnp.full(world.pairs, agreement.NEVER), None if word is None else word.position)
 
 
 def precision_for(count: int) -> prox.Precision:
@@ -508,9 +567,11 @@ def world_of(
     speaks: str = "link",
     partial: bool = False,
     live: Live | None = None,
+    events: bool = False,
 ) -> World:
     """Everything that does not change; arguments as in `consat.engine.rounds.simulate_rounds`; speaks: see `consat.protocols.Rounds`;
-    partial: whether it is of one process among several, which must know whose messages to count; live: what may change."""
+    partial: whether it is of one process among several, which must know whose messages to count; live: what may change; events: whether
+    agents send only what is news."""
     receiver, sender, block = copies.ends()
     talker, listener = (np.repeat(copies.holder[rows * block], block) for rows in (receiver, sender))
     everyone = Everyone(
@@ -532,7 +593,7 @@ def world_of(
     rough = weather.loss > 0 or weather.sleep > 0 or weather.burst is not None
     keys = talker.astype(np.int64) * team.count + listener
     pairs = distinct(keys)
-    if not (rough or partial):  # then nobody asks who is at the ends
+    if not (rough or partial or events):  # then nobody asks who is at the ends
         talker, keys = talker[:0], keys[:0]
     reach = None if body is None else body.reach
     return World(
@@ -552,6 +613,7 @@ def world_of(
         burst=None if weather.burst is None else jnp.asarray(weather.burst, dtype=float),
         noise=on_device(body.noise) if body is not None and body.noise > 0 else None,
         drive=None if body is None else body.drive,
+        events=events,
     )
 
 

@@ -65,6 +65,7 @@ class Tally(Steps):
         last_unknown: the last round after which not everybody knew, or −1.
         messages: sent.
         floats: sent.
+        bytes: sent.
         smooth_margin: the last.
         bound: the last.
         held: after how many rounds, the start among them, every constraint held.
@@ -82,6 +83,7 @@ class Tally(Steps):
     last_unknown: int = -1
     messages: int = 0
     floats: int = 0
+    bytes: int = 0
     smooth_margin: float = np.nan
     bound: float = np.nan
     asked: int = 0
@@ -110,6 +112,7 @@ class Tally(Steps):
         self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
         self.messages += int(np.sum(np.asarray(chunk.messages)[:count]))
         self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
+        self.bytes += int(np.sum(np.asarray(chunk.bytes)[:count]))
         self.violated = None if chunk.violated is None else np.asarray(self.violated) + np.asarray(chunk.violated)
         self.done += count
         self.margin, self.smooth_margin, self.bound = (float(leaf[count - 1]) for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound))
@@ -170,6 +173,7 @@ def simulate_rounds(
     hopeless: Callable[[np.ndarray], bool] = lambda _: False,
     enough: Callable[[np.ndarray], bool] | None = None,
     then: Estimates | None = None,
+    events: bool = False,
     progress: Callable[[float, float], None] = lambda *_: None,
 ) -> Trace:
     """Run a protocol in rounds.
@@ -194,6 +198,7 @@ def simulate_rounds(
         hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
         enough: says of (N, d) positions whether no formation is better by more than a tolerance.
         then: the layout to which the team goes over where that of `copies` has not satisfied it in time, see `TURN`; None if it has none.
+        events: whether agents send only what is news, see `consat.protocols.sending`.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     weather = weather or Weather()
@@ -207,12 +212,13 @@ def simulate_rounds(
         engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
     else:
         live = Live.of(team, 0.0 if body is None else 1.0 / body.rate, all_of_them=False)
-        world = world_of(team, copies, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks, live=live)
+        how: Any = {"convex": convex, "weather": weather, "body": body, "speaks": protocol.speaks, "events": events}
+        world = world_of(team, copies, nu, size, live=live, **how)
         most = longest_hold(protocol, world)
         ends = (HOLD, most) if stop == "satisfied" else None
         engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
         if then is not None:
-            other = functools.partial(world_of, team, then, nu, size, convex=convex, weather=weather, body=body, speaks=protocol.speaks)
+            other = functools.partial(world_of, team, then, nu, size, **how)
             turn = Turn(lambda first: OneProcess(
                 protocol, other(), first, later(weather.seed), _over(choice, copies, then), ends, knowing=ENOUGH[stop]
             ), copies, then)  # fmt: skip
@@ -221,7 +227,8 @@ def simulate_rounds(
         earliest=protocol.earliest(engine.world.everyone),
         hopeless=hopeless, enough=enough, turn=None if turn is None else turn_after(engine.world),
     )  # fmt: skip
-    problem = "" if checkpoint is None else fingerprint(team, protocol, nu, size, first, weather, body, copies.layout, convex)
+    how_run = (protocol, nu, size, first, weather, body, copies.layout, convex, *["events"] * events)
+    problem = "" if checkpoint is None else fingerprint(team, *how_run)
     course = _Course(team, engine, rules, choice, body, turn)
     if turn is not None and checkpoint is not None and checkpoint.turned:
         course.turn(np.zeros((turn.after.count, team.dimension)))
@@ -391,6 +398,7 @@ class _Course:
             "satisfied_from": float(tally.last_bad + 1) if tally.last_bad < tally.done else None,
             "messages": tally.messages,
             "floats_sent": tally.floats,
+            "bytes": tally.bytes,
             **_known(tally),
             "turned": tally.turned,
             "period": self._period,

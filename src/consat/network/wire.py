@@ -1,4 +1,4 @@
-"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 3.
+"""The wire format: a header, two names, the shapes of a few arrays, their numbers, a checksum. Little-endian, version 4.
 
     offset  bytes  what
     0       4      b"csat"
@@ -11,8 +11,9 @@
     40      24     sent, echo, ν_β                           float64
     64      4      length of source, of destination          unsigned, 2 bytes each
     68             source, destination                       UTF-8
-                   for each array: dimensions (1 byte), rows, columns (4 bytes each; columns is 0 for a vector)
-                   for each array: its numbers, float64, row by row
+                   for each array: dimensions (1 byte; 4 more where numbers are of 32 bits), rows, columns (4 bytes each; columns is 0 for
+                   a vector)
+                   for each array: its numbers, float64 or float32, row by row
     −4      4      CRC-32 of all before it
 
 Nothing received is ever unpickled or evaluated. There is one way to write a message, and whatever differs is refused. The checksum finds
@@ -26,7 +27,7 @@ import struct
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Final, NamedTuple
@@ -37,8 +38,8 @@ import numpy as np
 from consat.errors import NetworkError, shown
 
 MAGIC: Final = b"csat"
-VERSION: Final = 3
-"""Since messages hold what is for a neighbour as a whole. Others are refused."""
+VERSION: Final = 4
+"""Since numbers may be of 32 bits, and a message may say that there is nothing new. Others are refused."""
 LONGEST: Final = 2**22
 """No message has more bytes."""
 MOST_ARRAYS: Final = 32
@@ -56,6 +57,9 @@ _ZERO: Final = 7
 """Where in the header 0 stands."""
 _SHAPE: Final = struct.Struct("<BII")
 _CHECKSUM: Final = struct.Struct("<I")
+_SINGLE: Final = 4
+"""Added to the dimensions of an array of 32 bits."""
+_TYPES: Final = {False: "<f8", True: "<f4"}
 _LARGEST_COUNT: Final = 2**64 - 1
 
 
@@ -66,6 +70,7 @@ class Kind(IntEnum):
     STATE = 2
     GOODBYE = 3
     RESEND = 4
+    SAME = 5
 
 
 class Reason(StrEnum):
@@ -126,21 +131,23 @@ class Numbers(NamedTuple):
         shape: (n,) or (rows, columns).
         largest: no magnitude is above it, or above that of its column. With inf, infinities may stand there; NaN may stand nowhere.
         sound: whether numbers within these limits, flat, make sense together; None where any do.
+        single: whether they are of 32 bits.
     """
 
     shape: tuple[int, ...]
     largest: float | tuple[float, ...] = sys.float_info.max
     sound: Callable[[np.ndarray], bool] | None = None
+    single: bool = False
 
 
 Expected = Mapping[Kind, Sequence[Numbers | tuple[int, ...]]]
 """For each kind, its arrays; a kind that is missing is refused. A plain shape allows all finite numbers."""
 
 
-def encode(message: Message) -> bytes:
-    """The message as bytes."""
+def encode(message: Message, single: Container[int] = ()) -> bytes:
+    """The message as bytes; single: which of its arrays are written in 32 bits."""
     source, destination = _name(message.source), _name(message.destination)
-    arrays = [np.ascontiguousarray(array, dtype="<f8") for array in message.arrays]
+    arrays = [np.ascontiguousarray(array, dtype=_TYPES[k in single]) for k, array in enumerate(message.arrays)]
     if len(message.problem) != 8 or len(arrays) > MOST_ARRAYS:
         raise NetworkError(
             f"a message must have a problem hash of 8 bytes and at most {MOST_ARRAYS} arrays, not {len(message.problem)} and {len(arrays)}"
@@ -154,7 +161,7 @@ def encode(message: Message) -> bytes:
     except struct.error as error:
         numbers = message.incarnation, message.sequence, message.ack
         raise NetworkError(f"incarnation, sequence and ack must be integers in 0 … 2⁶⁴ − 1, not {numbers}: {error}") from None
-    shapes = [_shape(array.shape) for array in arrays]
+    shapes = [_shape(array.shape, single=k in single) for k, array in enumerate(arrays)]
     body = b"".join((header, source, destination, *shapes, *(array.tobytes() for array in arrays)))
     if len(body) + _CHECKSUM.size > LONGEST:
         raise NetworkError(f"a message has {len(body)} bytes, but the longest allowed has {LONGEST}")
@@ -264,7 +271,7 @@ class Checker:
         at += long + far
         if at + layout.bytes != end or count != layout.count or not payload.startswith(layout.shapes, at):
             return Reason.SHAPE
-        numbers = np.frombuffer(payload, "<f8", layout.numbers, at + len(layout.shapes)).astype(float)  # a copy, aligned
+        numbers = layout.read(memoryview(payload), at + len(layout.shapes))
         if not (math.isfinite(sent) and not math.isinf(echo) and 0 <= nu_beta < math.inf):
             return Reason.NUMBER
         if (wrong := layout.wrong(numbers)) is not None:
@@ -272,7 +279,7 @@ class Checker:
         if (refused := neighbour.window.refuse(incarnation, sequence, self._clock(), self._quiet)) is not None:
             return refused
         return Message(
-            Kind(kind), problem, neighbour.name, self._me.decode(), incarnation, sequence, sent, echo, ack, nu_beta, layout.cut(numbers)
+            Kind(kind), problem, neighbour.name, self._me.decode(), incarnation, sequence, sent, echo, ack, nu_beta, layout.cut(numbers),
         )  # fmt: skip
 
 
@@ -284,6 +291,7 @@ class _Layout:
         count: of arrays.
         shapes: the bytes that tell them.
         slices: of each array, where its numbers begin and end among all, and its shape.
+        single: which arrays are of 32 bits.
         numbers: how many, in all arrays.
         largest: the largest magnitude of each number, or of all.
         sound: of arrays that are to make sense, where their numbers begin and end, and what tells.
@@ -293,6 +301,7 @@ class _Layout:
     count: int
     shapes: bytes
     slices: tuple[tuple[int, int, tuple[int, ...]], ...]
+    single: tuple[int, ...]
     numbers: int
     largest: np.ndarray
     sound: tuple[tuple[int, int, Callable[[np.ndarray], bool]], ...]
@@ -301,7 +310,7 @@ class _Layout:
     @classmethod
     def of(cls, arrays: Sequence[Numbers | tuple[int, ...]]) -> _Layout:
         each = [array if isinstance(array, Numbers) else Numbers(array) for array in arrays]
-        shapes = b"".join(_shape(array.shape) for array in each)
+        shapes = b"".join(_shape(array.shape, single=array.single) for array in each)
         sizes = [math.prod(array.shape) for array in each]
         ends = np.cumsum(sizes, dtype=int).tolist()
         slices = tuple((end - size, end, array.shape) for end, size, array in zip(ends, sizes, each, strict=True))
@@ -309,11 +318,24 @@ class _Layout:
         largest = np.concatenate([np.zeros(0), *limits])
         if len(set(largest.tolist())) == 1:
             largest = largest[:1]
-        total = len(shapes) + 8 * sum(sizes)
+        total = len(shapes) + sum(size * (4 if array.single else 8) for size, array in zip(sizes, each, strict=True))
+        single = tuple(k for k, array in enumerate(each) if array.single)
         if len(each) > MOST_ARRAYS or total > LONGEST:
             raise NetworkError(f"a message may have at most {MOST_ARRAYS} arrays and {LONGEST} bytes, not {len(each)} and {total}")
         sound = tuple((begin, end, array.sound) for (begin, end, _), array in zip(slices, each, strict=True) if array.sound is not None)
-        return cls(len(each), shapes, slices, sum(sizes), largest, sound, total)
+        return cls(len(each), shapes, slices, single, sum(sizes), largest, sound, total)
+
+    def read(self, payload: memoryview, at: int) -> np.ndarray:
+        """All numbers, from where they begin; a copy, aligned."""
+        if not self.single:
+            return np.frombuffer(payload, _TYPES[False], self.numbers, at).astype(float)
+        parts = [np.zeros(0)]
+        for k, (begin, end, _) in enumerate(self.slices):
+            part = np.frombuffer(payload, _TYPES[k in self.single], end - begin, at)
+            with np.errstate(invalid="ignore"):  # of signalling NaN, which is refused like any other
+                parts.append(part.astype(float))
+            at += part.nbytes
+        return np.concatenate(parts)
 
     def wrong(self, numbers: np.ndarray) -> Reason | None:
         """What is, with the numbers of a message."""
@@ -376,7 +398,7 @@ def _name(text: str) -> bytes:
     return name
 
 
-def _shape(shape: tuple[int, ...]) -> bytes:
+def _shape(shape: tuple[int, ...], *, single: bool = False) -> bytes:
     if len(shape) not in {1, 2} or max(shape) > LONGEST:
         raise NetworkError(f"arrays of a message must be vectors or matrices of at most {LONGEST} bytes, not of shape {shape}")
-    return _SHAPE.pack(len(shape), shape[0], shape[1] if len(shape) == 2 else 0)
+    return _SHAPE.pack(len(shape) + (_SINGLE if single else 0), shape[0], shape[1] if len(shape) == 2 else 0)

@@ -69,6 +69,8 @@ class Admm:
             can circle about each other; a stiffer penalty breaks that cycle.
         fall: relative decrease of ρ_i, at most, in the time a message needs to cross the team, once all are known to be satisfied.
         horizon: number of such crossings after which changes of ρ fade out, so that the convergence proof for fixed ρ applies.
+        tolerance: with ``sends=events``, largest difference between a point and what the neighbour holds, in the team's unit of length.
+        loose: the same for a penalty, as a fraction of it.
     """
 
     relaxation: float = 0.7
@@ -80,6 +82,8 @@ class Admm:
     hurry: float = 10.0
     fall: float = 0.2
     horizon: float = 50.0
+    tolerance: float = 1e-4
+    loose: float = 0.1
     name = "admm"
     speaks: ClassVar[str] = "link"
     per: ClassVar[Mapping[str, Any]] = {"x": "row", "u": "link", "wish": "row", "heard": "link", "penalty": "link", "memory": "agent"}
@@ -118,6 +122,14 @@ class Admm:
         wish = jnp.clip(jnp.maximum(goal, least), lowest, wish * (1.0 + solver.to_rows(rise)))
         here = links.at(x)
         return AdmmState(x, u, wish, state.heard, rho, memory), (here, rho[:, None] * (u - here), links.at(wish))
+
+    def news(self, said: tuple[Array, Array, Array], held: tuple[Array, Array, Array], solver: Solver) -> Array:
+        (here, force, wish), (there, pull, rho) = said, held
+        apart = jnp.abs(here - there).max(axis=1, initial=0.0) + jnp.abs(force - pull).max(axis=1, initial=0.0) / wish
+        return (apart > self.tolerance * solver.length) | (jnp.abs(wish - rho) > self.loose * rho)
+
+    def brief(self, message: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        return message
 
     def hear(self, state: AdmmState, message: tuple[Array, Array, Array], arrived: Array, solver: Solver) -> AdmmState:
         there, force, wish = message

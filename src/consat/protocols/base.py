@@ -210,6 +210,20 @@ class Rounds(Protocol):
         """
         ...
 
+    def news(self, said: Any, held: Any, solver: Solver) -> Array:
+        """Whether what would be said differs from what a neighbour holds by more than it can do without; one row of what `speaks` says.
+
+        Args:
+            said: what would be.
+            held: what was sent last.
+            solver: own.
+        """
+        ...
+
+    def brief(self, message: Any) -> Any:
+        """The message as it is sent where few bytes count: numbers that may be are rounded to 32 bits."""
+        ...
+
     def hear(self, state: Any, message: Any, arrived: Array, solver: Solver) -> Any:
         """Update the state with the received messages.
 

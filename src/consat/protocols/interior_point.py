@@ -36,6 +36,7 @@ from jax import Array
 
 from consat.protocols.base import Known, Solver
 from consat.protocols.local.interior import Gains, Interior, Mail, Memory
+from consat.protocols.sending import single
 
 
 class InteriorState(NamedTuple):
@@ -71,6 +72,9 @@ class InteriorPoint:
         warm: number of initial rounds in which an agent maximises the mean of its margins instead. It applies to agents with only quadratic
             ψ and an initial margin below −`far`.
         far: see `warm`; in the team's unit of ψ.
+        tolerance: with ``sends=events``, largest difference between a quadratic and what the neighbour holds, as a fraction of its
+            largest entry. Levels may differ by μ, barriers by a factor of two. The same fraction holds for a proof while the level is
+            below `PROVES`, or without a cap.
         name: name of the protocol in ``--protocol``.
     """
 
@@ -84,6 +88,7 @@ class InteriorPoint:
     drop: float = 3.0
     warm: int = 1
     far: float = 0.0
+    tolerance: float = 0.3
     name: str = "interior-point"
     speaks: ClassVar[str] = "pair"
     per: ClassVar[Mapping[str, Any]] = {
@@ -106,6 +111,33 @@ class InteriorPoint:
     def speak(self, state: InteriorState, solver: Solver, round_: Array, known: Known) -> tuple[InteriorState, Mail]:
         memory, mail = _own(solver).round(state.memory, state.inbox, known.margin, self.gains)
         return InteriorState(memory, state.inbox), mail
+
+    def news(self, said: Mail, held: Mail, solver: Solver) -> Array:
+        def apart(new: Array, old: Array) -> Array:
+            axes = tuple(range(1, new.ndim))
+            return jnp.abs(new - old).max(axis=axes, initial=0.0) > self.tolerance * jnp.abs(new).max(axis=axes, initial=0.0)
+
+        barrier = jnp.maximum(said.barrier, 0.0)
+        differs = (said.barrier < 0) != (held.barrier < 0)
+        differs |= apart(said.matrix, held.matrix) | apart(said.vector, held.vector)
+        differs |= (jnp.abs(said.level - held.level) > barrier) & (said.barrier >= 0)
+        differs |= (said.barrier > 2.0 * held.barrier) | (2.0 * said.barrier < held.barrier)
+        new, old = said.proof, held.proof
+        proves = (
+            (said.changes != held.changes)
+            | ((new.weight < 0) != (old.weight < 0))
+            | apart(new.matrix, old.matrix)
+            | apart(new.vector, old.vector)
+        )
+        proves |= (said.margin != held.margin) & ~(jnp.abs(said.margin - held.margin) <= EXACTLY)
+        return differs | (proves & (True if self.cap is None else said.level < PROVES))
+
+    def brief(self, message: Mail) -> Mail:
+        """Proofs stay as they are, since any rounding of theirs would have to be outward."""
+        matrix, vector, barrier, level, margin = map(
+            single, (message.matrix, message.vector, message.barrier, message.level, message.margin)
+        )  # fmt: skip
+        return Mail(matrix, vector, barrier, level, margin, message.changes, message.proof)
 
     def hear(self, state: InteriorState, message: Mail, arrived: Array, solver: Solver) -> InteriorState:
         def take(new: Array, old: Array) -> Array:
@@ -133,6 +165,8 @@ def _own(solver: Solver) -> Interior:
     return solver.interior
 
 
+PROVES = 0.1
+"""In units of ψ: a team whose level is above is satisfied, or about to be, and asks for no proof that it cannot be."""
 NEARLY, EXACTLY = 0.05, 1e-3
 """A margin is near the best if its gap to the bound is at most `NEARLY` times |bound|, or at most `EXACTLY` in units of ψ."""
 

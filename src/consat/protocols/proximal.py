@@ -66,5 +66,12 @@ class Proximal:
     def _kappa(self, x: Array, solver: Solver) -> Array:
         return jnp.zeros(len(x)) + 1.0 / (self.step * solver.length**2)
 
+    def news(self, said: Array, held: Array, solver: Solver) -> Array:
+        """Whatever differs is: both ends must integrate the same differences."""
+        return jnp.any(said != held, axis=1)
+
+    def brief(self, message: Array) -> Array:
+        return message
+
     def hear(self, state: ProximalState, message: Array, arrived: Array, solver: Solver) -> ProximalState:
         return state._replace(heard=jnp.where(arrived[:, None], message, state.heard))

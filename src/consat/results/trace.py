@@ -34,6 +34,7 @@ class Trace:
         satisfied_from: first step after the last step with a margin ≤ 0; None if the last margin is ≤ 0.
         messages: total number of messages sent; None in continuous time.
         floats_sent: total number of floats sent; None in continuous time.
+        bytes: total size of the messages with their headers, without names of agents and shapes of arrays; None in continuous time.
         known: what all agents know at the end: that all are ``satisfied``, that the team is ``infeasible``, or None.
         known_from: the round from which they know it, or the time, s, over a network without common rounds. None in continuous time, and if
             they know nothing.
@@ -78,6 +79,7 @@ class Trace:
     bound: np.ndarray | None = None
     motion: Mapping[str, Any] | None = None
     heading: np.ndarray | None = None
+    bytes: int | None = None
 
     @property
     def end(self) -> np.ndarray:

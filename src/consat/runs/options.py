@@ -16,6 +16,7 @@ from consat.engine.round import Body, Weather
 from consat.errors import InvalidSettings
 from consat.problem.team import Team
 from consat.protocols.estimates import Layout
+from consat.protocols.sending import SENDS, Sends
 from consat.settings import Smoothing
 
 if TYPE_CHECKING:
@@ -67,6 +68,16 @@ class Options:
     simulator: str | None = None
     restarts: int = 1
     burst: tuple[float, float] | None = None
+    sends: Sends = "all"
+
+    def __post_init__(self) -> None:
+        if self.sends not in SENDS:
+            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(SENDS)}")
+
+    @property
+    def events(self) -> bool:
+        """Whether agents send only what is news."""
+        return self.sends == "events"
 
     @property
     def data(self) -> dict[str, Any]:
@@ -101,7 +112,7 @@ class Options:
             name: getattr(self, name)
             for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise", "simulator")
         }
-        given["restarts"] = self.restarts - 1
+        given |= {"restarts": self.restarts - 1, "sends": self.events}
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
             raise InvalidSettings(message)

@@ -22,6 +22,7 @@ from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
 from consat.protocols.estimates import Estimates, Layout
+from consat.protocols.sending import Sends
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
 from consat.runs.advice import around_loops
@@ -54,6 +55,7 @@ def run(
     wind: Sequence[float] = (),
     noise: float = 0.0,
     simulator: str | None = None,
+    sends: Sends = "all",
     auxiliary: float | None = None,
     restarts: int = 1,
     record: bool | None = None,
@@ -92,6 +94,7 @@ def run(
         wind: (d,) velocity of the air, m/s, for robots.
         noise: largest error of a robot's measured position, m.
         simulator: integrates the bodies of robots: ``mujoco``, or, if None, the robots' own models.
+        sends: ``all``: every agent sends in every round; ``events``: only what is news, see `consat.protocols.sending`. For rounds.
         auxiliary: radius, length, of a constraint that is added to every agent: to stay within it of the team's centre (paper, remark 2).
         restarts: number of starts, with `seed` and the seeds after it, which run as one computation. The result is that of the start whose
             run ends with the largest margin. For rounds.
@@ -115,7 +118,7 @@ def run(
     options = Options(
         protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, until=until, rounds=rounds, stop=stop,
         loss=loss, sleep=sleep, speed=speed, auxiliary=auxiliary, record=record, agents=agents, every=every,
-        wind=tuple(map(float, wind)), noise=noise, simulator=simulator, restarts=restarts,
+        wind=tuple(map(float, wind)), noise=noise, simulator=simulator, restarts=restarts, sends=sends,
         burst=None if burst is None else tuple(map(float, burst)),  # type: ignore[arg-type]
     )  # fmt: skip
     if checkpoint is not None and out is None:
@@ -179,6 +182,7 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
         options.require_flow(kind, team)
         return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=options.until, **how))
     pace, weather = options.pace(kind, team), options.weather(settings.start.seed)
+    how |= {"events": options.events}
     if options.restarts > 1:
         found = best_start(team, settings, options)
         settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
@@ -188,8 +192,9 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """Check that several processes can run the team. Raises: InvalidSettings: they cannot."""
-    if options.restarts > 1 or options.robots is not None or options.burst is not None:
-        raise InvalidSettings("several processes run points, from one start, and lose messages one by one; use one process for more")
+    if options.restarts > 1 or options.robots is not None or options.burst is not None or options.events:
+        message = "several processes run points, from one start, lose messages one by one, and send all; use one process for more"
+        raise InvalidSettings(message)
     if kind in FLOWS or checkpoints:
         raise InvalidSettings("several processes run protocols in rounds, and without checkpoints")
     if team.moves:

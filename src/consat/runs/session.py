@@ -37,6 +37,7 @@ from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
 from consat.protocols.estimates import Layout
 from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior.layout import form_of
+from consat.protocols.sending import Sends
 from consat.results.result import Result
 from consat.results.trace import Trace
 from consat.runs.options import RATE, Options
@@ -99,6 +100,7 @@ class Session:
         wind: as in `consat.run`.
         noise: as in `consat.run`.
         simulator: as in `consat.run`.
+        sends: as in `consat.run`.
 
     Raises:
         InvalidTeam: agents that depend on each other are not connected by links (Assumption 1).
@@ -112,13 +114,13 @@ class Session:
         start: tuple[Any, Any] | None = None, smoothing: Smoothing | None = None, loss: float = 0.0, sleep: float = 0.0,
         burst: tuple[float, float] | None = None,
         rate: float | None = None, speed: float | None = None, robots: Any = None, obstacles: Sequence[Any] | None = None,
-        wind: Sequence[float] = (), noise: float = 0.0, simulator: str | None = None,
+        wind: Sequence[float] = (), noise: float = 0.0, simulator: str | None = None, sends: Sends = "all",
     ) -> None:  # fmt: skip
         scenario = scenario_of(team)
         self._options = Options(
             protocol=protocol, estimates=estimates, seed=seed, start=start, smoothing=smoothing, loss=loss, sleep=sleep, burst=burst,
             rate=rate or scenario.rate or RATE, speed=speed, stop="never", wind=tuple(map(float, wind)), noise=noise,
-            simulator=simulator,
+            simulator=simulator, sends=sends,
             robots=robots_of(robots, obstacles, scenario),
         )  # fmt: skip
         self._name = scenario.name
@@ -460,7 +462,8 @@ class Session:
             margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin, estimate=None, integral=None,
             holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
             satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
-            floats_sent=tally.floats, known=known_of(tally), known_from=None, seconds={"compile": 0.0, "run": 0.0}, period=period,
+            floats_sent=tally.floats, bytes=tally.bytes, known=known_of(tally), known_from=None,
+            seconds={"compile": 0.0, "run": 0.0}, period=period,
             bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
         )  # fmt: skip
         scenario = dataclasses.replace(scenario_of(team), name=self._name)
@@ -493,7 +496,7 @@ class Session:
         assert live is not None
         world = world_of(
             team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=self._weather, body=body,
-            speaks=self._protocol.speaks, live=live,
+            speaks=self._protocol.speaks, live=live, events=self._options.events,
         )  # fmt: skip
         choice = Choice.of(team, ready.copies, "all", estimates=False)
         carrier = OneProcess(self._protocol, world, first, self._weather.seed, choice, None)

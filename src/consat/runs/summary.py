@@ -75,6 +75,7 @@ def summarise(
         "ending": trace.ending,
         "messages": trace.messages,
         "floats_sent": trace.floats_sent,
+        "bytes": trace.bytes,
         "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
         "agents": _agents(team, margins, multipliers, trace.violated) if listed else None,
         "clusters": _clusters(team, trace.cluster) if listed else None,

@@ -571,7 +571,8 @@ class Simulation:
     def _show_state(self) -> None:
         session = self._session
         self._show("state", {
-            "type": "state", "revision": self._revision, "playing": self._playing, "speed": self._speed, "loss": self._loss, "protocol": self._protocol,
+            "type": "state", "revision": self._revision, "playing": self._playing, "speed": self._speed, "loss": self._loss,
+            "protocol": self._protocol,
             "rate": session.rate, "undo": len(self._undos), "busy": self._busy, "cut": self._cut,
             "silent": {name: np.asarray(each.agent.start)[:3].tolist() for name, each in self._silent.items()},
         })  # fmt: skip

@@ -197,7 +197,10 @@ def _advice(summary: Mapping[str, Any]) -> str | None:
 def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     route = f" along {ROUTE[summary['route']]}" if summary.get("route") else ""
     yield "protocol", f"{summary['protocol']}{route}, {summary['estimates']} estimates, seed {summary['seed']}"
-    units = ("rounds", "round", "rounds"), ("messages", "message", "messages"), ("floats_sent", "number sent", "numbers sent")
+    units = (
+        ("rounds", "round", "rounds"), ("messages", "message", "messages"), ("floats_sent", "number sent", "numbers sent"),
+        ("bytes", "byte", "bytes"),
+    )  # fmt: skip
     effort = [counted(summary[key], *unit) for key, *unit in units if summary.get(key) is not None]
     if summary.get("time") is not None:
         effort.insert(0, f"until t = {_number(summary['time'])} s")

@@ -26,6 +26,7 @@ from consat.problem.objective import Schedule
 from consat.problem.team import Team
 from consat.problem.units import automatic, scale
 from consat.protocols import ROUNDS
+from consat.protocols.sending import Sends
 from consat.results.result import Result
 from consat.results.trace import Ending
 from consat.runs.options import RATE as ROUNDS_A_SECOND
@@ -64,6 +65,7 @@ class Plan:
         stop: condition for an earlier end; None for the default in `ending`.
         keys: folder of the team's keys, see ``consat keys``; None for links without protection.
         commands: path of a file of timed changes, see `consat.network.deploy.commands`; None for no changes.
+        sends: ``all``, or only what is news: ``events``; see `consat.protocols.sending`.
     """
 
     mode: Mode = DEFAULT_MODE
@@ -77,9 +79,10 @@ class Plan:
     stop: Stop | None = None
     keys: Path | None = None
     commands: Path | None = None
+    sends: Sends = "all"
 
     def __post_init__(self) -> None:
-        Manner(self.mode, self.rate, self.pace)  # raises once, before any agent starts, if the mode options are not valid
+        Manner(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if the mode options are not valid
 
     @property
     def ending(self) -> Stop:
@@ -98,6 +101,7 @@ class Plan:
             "--mode": self.mode, "--rate": self.rate, "--speed": self.speed, "--rounds": self.rounds,
             "--pace": self.pace if self.pace != 1.0 else None, "--loss": self.loss or None,
             "--delay": f"{self.delay[0]},{self.delay[1]}" if self.delay[1] else None, "--keys": self.keys,
+            "--sends": None if self.sends == "all" else self.sends,
         }  # fmt: skip
         return [text for name, value in given.items() if value is not None for text in (name, str(value))]
 

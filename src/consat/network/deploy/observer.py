@@ -227,6 +227,7 @@ class Observer:
             satisfied_from=satisfied_from(steps, margin, interpolate=False),
             messages=sent["messages"],
             floats_sent=sent["floats"],
+            bytes=sent["bytes"],
             known=self.all_known()[0],
             known_from=self._known_from(),
             seconds=seconds,

@@ -222,11 +222,11 @@ class RoundCore:
         self.ends = ends(self.part)
         self.solver = Alone.of(self.part)
         self._begin, self._turn, *_ = _compiled()
-        self._layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
-        self.width = sum(self._layout.sizes) + 1
+        self.layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
+        self.width = sum(self.layout.sizes) + 1
         # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
         single = PENALTY / whole.length**2 if protocol.name == "admm" else np.inf
-        self.largest = np.array([*(LARGEST if shape else single for shape, size in self._layout.each for _ in range(size)), LARGEST])
+        self.largest = np.array([*(LARGEST if shape else single for shape, size in self.layout.each for _ in range(size)), LARGEST])
         self.letters = no_letters(whole)
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> _Now:
@@ -234,7 +234,7 @@ class RoundCore:
 
     def turn(self, state: _Now, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         heard = inbox.link, arrived.link, moment.fresh
-        now, outbox = self._turn(self.protocol, self._layout, self.solver, state, heard, (moment.round, moment.margin, moment.time))
+        now, outbox = self._turn(self.protocol, self.layout, self.solver, state, heard, (moment.round, moment.margin, moment.time))
         return Turned(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
 
     def among(self, gone: Collection[str], whole: Part | None = None) -> RoundCore:
@@ -362,6 +362,8 @@ class Embodied:
         self.width = core.width + dimension + 2
         self.largest = np.append(core.largest, np.full(dimension + 2, LARGEST))
         self.letters = core.letters
+        self.ages = (*([core.width - 1] if core.width else []), self.width - 1)
+        """Columns of the rows that say for how many rounds something has held."""
         self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> EmbodiedState:

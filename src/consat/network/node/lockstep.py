@@ -9,6 +9,7 @@ its stored state restarts in the round of its slowest neighbour; a protocol that
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, Final
 
@@ -106,15 +107,27 @@ class Lockstep:
             if message.kind is Kind.HELLO:
                 self._lacking.add(message.source)
             elif message.kind is Kind.STATE:
-                current, previous, reached = message.arrays[:2], message.arrays[2:4], int(message.arrays[4][0])
+                *frames, stamp = message.arrays
+                half, reached = len(frames) // 2, int(stamp[0])
+                current, previous = frames[:half], frames[half:]
                 if reached > self._round and not self._confirmed(message.source, reached):
                     continue
                 if reached == self._reached.get(message.source):
                     self._lacking.add(message.source)  # a repeated message: the neighbour waits
                 self._reached[message.source] = reached
-                blocks = self._blocks[message.source]
-                due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
-                self._blocks[message.source] = due | {reached: current, reached - 1: previous}
+                self._take(message.source, reached, current, previous)
+            elif message.kind is Kind.SAME:
+                reached = int(message.arrays[0][0])
+                before = self._blocks[message.source].get(reached - 1)
+                if before is not None and reached <= self._round:  # else the neighbour is asked to say it all
+                    self._reached[message.source] = reached
+                    self._take(message.source, reached, self.station.same(before), before)
+
+    def _take(self, neighbour: str, reached: int, current: Sequence[np.ndarray], previous: Sequence[np.ndarray]) -> None:
+        """Keep what a neighbour said in a round and in the one before."""
+        blocks = self._blocks[neighbour]
+        due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
+        self._blocks[neighbour] = due | {reached: current, reached - 1: previous}
 
     def _confirmed(self, neighbour: str, reached: int) -> bool:
         """Whether a neighbour has reported an impossibly late round in `SUPPORT` consecutive messages. It can be true only if this agent
@@ -153,13 +166,14 @@ class Lockstep:
                 station.sort(neighbour, block, inbox, arrived)
         moment = self._moment(self._round - self._regrouped)
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
+        outbox, told = station.sift(outbox)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
         self._usual = min(now - self._began, 1.05 * self._usual, SELDOM)
         self._patience = max(RESEND, min(USUAL * self._usual, SELDOM))
         self._began = now
         self._save()
-        self._speak(now)
+        self._speak(now, told)
         station.move(look, float(self._round))
         if self._over():
             station.log("finished", round=self._round)
@@ -171,7 +185,8 @@ class Lockstep:
         time = (self._round + 1.0) * self._tick
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
-    def _speak(self, now: float) -> None:
+    def _speak(self, now: float, among: AbstractSet[str] | None = None) -> None:
+        """Say what there is to say of this round; that nothing is new to those who are not `among` some."""
         station = self.station
         assert self._outbox is not None
         current, previous = (station.blocks(outbox) for outbox in self._outbox)
@@ -179,7 +194,9 @@ class Lockstep:
         self._said = {neighbour: [*told, *previous[neighbour], number] for neighbour, told in current.items()}
         self._lacking.clear()
         self._spoke = now
-        station.say(self._said)
+        station.say(self._said, among=among)
+        if among is not None:
+            station.say_same(number, station.silent(among))
 
     def _repeat(self, now: float) -> None:
         """Repeat the last message: to all neighbours while waiting, and after the last round to those that lack it."""
@@ -207,6 +224,7 @@ class Lockstep:
         else:  # an agent has joined, or messages per neighbour refer to the old membership: compute new messages
             inbox, nothing = station.empty()
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
+            outbox, _ = station.sift(outbox)
             self._outbox = outbox, outbox
         self._save()
         self._speak(station.clock())
@@ -259,5 +277,6 @@ class Lockstep:
         nothing, _ = station.empty()
         self._outbox = read(nothing), read(nothing)
         self._state = read(station.core.begin(station.among(station.part.first)))
+        station.resume(self._outbox[0], self._state)
         station.log("resumed", round=self._round)
         self._speak(station.clock())

@@ -21,11 +21,14 @@ from consat.network.node.part import RUNS, Part
 from consat.network.node.station import REPORT, Log, Station
 from consat.network.transports import Transport
 from consat.protocols import PAIRED, ROUNDS, with_gains
+from consat.protocols.sending import BEAT, SENDS, Sends
 
 Mode = Literal["interior-point", "admm", "link", "lockstep"]
 DEFAULT_MODE: Final = "interior-point"
 RATE: Final = {"interior-point": 100.0, "admm": 100.0, "link": 50.0}
 """Default rate of steps, Hz, for each mode."""
+HEARTBEAT: Final = 0.08
+"""Longest silence of an agent, s: a neighbour takes it to be down only if six messages in succession are lost."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Manner:
         memory: in mode lockstep, a file for the state, from which a restarted agent continues; None for none.
         give_up: silence of a neighbour, s, after which it counts as having left for good.
         report: time between two reports, s.
+        sends: ``all``, or only what is news: ``events``; see `consat.protocols.sending`.
 
     Raises:
         InvalidSettings: unknown mode, or a setting that does not apply to it.
@@ -52,14 +56,26 @@ class Manner:
     memory: Path | None = None
     give_up: float = np.inf
     report: float = REPORT
+    sends: Sends = "all"
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
             raise InvalidSettings(f"there is no mode {self.mode!r}; choose one of {', '.join(get_args(Mode))}")
         if self.memory is not None and self.mode != "lockstep":
             raise InvalidSettings(f"mode {self.mode} needs no memory to start anew; only lockstep takes a memory file")
+        if self.sends not in SENDS:
+            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(SENDS)}")
+        if self.sends == "events" and self.mode == "link":
+            raise InvalidSettings("mode link integrates what it hears in time, and sends all; run another mode to send only what is news")
         if self.pace != 1.0 and self.mode != "link":
             raise InvalidSettings(f"mode {self.mode} has no time of its own; only link takes a pace")
+
+    @property
+    def beat(self) -> float | None:
+        """Turns of silence after which an agent repeats itself, ∞ in lockstep; None where it sends all."""
+        if self.sends == "all":
+            return None
+        return np.inf if self.mode == "lockstep" else min(float(BEAT), max(1.0, HEARTBEAT * (self.rate or RATE[self.mode]) // 1.0))
 
     @property
     def reliable(self) -> bool:
@@ -169,7 +185,7 @@ def runner_of(
     lockstep = manner.mode == "lockstep"
     station = Station(
         part, core or core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
-        frames=2 if lockstep else 1, stamped=lockstep, give_up=manner.give_up, report=manner.report, wall=wall,
+        frames=2 if lockstep else 1, stamped=lockstep, beat=manner.beat, give_up=manner.give_up, report=manner.report, wall=wall,
     )  # fmt: skip
     if lockstep:
         return Lockstep(station, turns=manner.turns, rate=manner.rate, memory=manner.memory)

@@ -97,8 +97,8 @@ class Peers:
                 accepted.append(message)
         return accepted
 
-    def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray]) -> None:
-        """Send a message to a neighbour."""
+    def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
+        """Send a message to a neighbour. `single`: indices of the arrays that are written in 32 bits."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         peer.said = now
@@ -116,7 +116,8 @@ class Peers:
                 ack,
                 float(self._part.nu.beta),
                 tuple(arrays),
-            )
+            ),
+            single,
         )
         self._transport.send(neighbour, payload)
         self.sent["messages"] += 1

@@ -112,7 +112,8 @@ class Paced:
         self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1
-        station.say(station.blocks(outbox))
+        outbox, listeners = station.sift(outbox)
+        station.say(station.blocks(outbox), among=listeners)
         station.move(look, now)
         if self._turns is not None and self._count >= self._turns:
             self.done = True

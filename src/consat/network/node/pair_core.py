@@ -69,7 +69,7 @@ class PairCore:
         self.width, self.largest = 0, np.zeros(0)
         self.letters = {neighbour.id: Letter.of(neighbour, whole.team.dimension).numbers() for neighbour in whole.neighbours}
         assert self.solver.interior is not None
-        self._packing = Packing.of(whole, self.part, self.solver.interior.plan.width)
+        self.packing = Packing.of(whole, self.part, self.solver.interior.plan.width)
         self._weight = {neighbour.id: Letter.of(neighbour, whole.team.dimension).weight for neighbour in whole.neighbours}
         order = [neighbour for neighbour, _ in self.ends]
         self._end = np.array([order.index(neighbour.id) for neighbour in self.part.neighbours], dtype=int)
@@ -81,7 +81,7 @@ class PairCore:
     def turn(self, state: PairState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
         heard = inbox.pair, arrived.pair, moment.fresh[self._end]
         when = moment.round, moment.margin, moment.time
-        state, said, bound, least = self._turn(self.protocol, self.solver, self._packing, state, heard, when)
+        state, said, bound, least = self._turn(self.protocol, self.solver, self.packing, state, heard, when)
         said = np.asarray(said)
         if asks_for(self.part) > FAR * self.part.reach:
             said, bound = self._without_proof(said), np.inf

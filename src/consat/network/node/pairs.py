@@ -68,9 +68,30 @@ class Letter(NamedTuple):
 
     def numbers(self) -> Numbers:
         """Validity conditions of such a message: shape, largest values, and `sound`."""
+        return Numbers((self.length,), tuple(self._largest().tolist()), functools.partial(sound, self.size, self.level))
+
+    def _largest(self) -> np.ndarray:
         largest = np.full(self.length, LARGEST)
         largest[0], largest[3] = MOST, np.inf
-        return Numbers((self.length,), tuple(largest.tolist()), functools.partial(sound, self.size, self.level))
+        return largest
+
+    def brief(self) -> tuple[Numbers, Numbers]:
+        """What its halves must be, see `halves`, where few bytes count."""
+        short, rest = (tuple(half.tolist()) for half in halves(self._largest(), self.weight))
+        return (
+            Numbers((len(short),), short, functools.partial(_quadratic_sound, self.size), single=True),
+            Numbers((len(rest),), rest, functools.partial(_proof_sound, self.size - self.level)),
+        )
+
+
+def halves(row: np.ndarray, weight: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of a message the numbers that may be rounded, μ, t, the least margin and the quadratic; and count and proof, which may not."""
+    return row[1:weight], np.concatenate([row[:1], row[weight:]])
+
+
+def whole(short: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The message of two halves."""
+    return np.concatenate([rest[:1], short, rest[1:]])
 
 
 def _both(size: int) -> int:
@@ -87,13 +108,20 @@ def sound(size: int, level: bool, numbers: np.ndarray) -> bool:
         level: whether the level is one of them.
         numbers: the entries of the message.
     """
-    at = HEAD + _both(size)
-    changes, barrier = numbers[:2]
-    weight, _, error = numbers[at : at + TAIL]
-    return (
-        changes >= 0 and changes == int(changes)
-        and (barrier >= 0 or barrier == -1) and (weight >= 0 or weight == -1) and error >= 0
-        and _semidefinite(numbers[HEAD:], size) and _semidefinite(numbers[at + TAIL :], size - level)
+    short, rest = halves(numbers, HEAD + _both(size))
+    return _quadratic_sound(size, short) and _proof_sound(size - level, rest)
+
+
+def _quadratic_sound(size: int, numbers: np.ndarray) -> bool:
+    barrier = numbers[0]
+    return bool(barrier >= 0 or barrier == -1) and _semidefinite(numbers[HEAD - 1 :], size)
+
+
+def _proof_sound(size: int, numbers: np.ndarray) -> bool:
+    changes, weight, _, error = numbers[: 1 + TAIL]
+    return bool(
+        changes >= 0 and changes == int(changes) and (weight >= 0 or weight == -1) and error >= 0
+        and _semidefinite(numbers[1 + TAIL :], size)
     )  # fmt: skip
 
 

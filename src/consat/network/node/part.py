@@ -144,8 +144,9 @@ class Part:
         assert isinstance(smoothing.nu_beta, float)
         return Nu(smoothing.nu_alpha, smoothing.nu_beta)
 
-    def problem(self, mode: str) -> bytes:
-        """Hash (8 bytes) of the run, the mode and the common knowledge. It is the same for all agents of a run; no private data enters."""
+    def problem(self, mode: str, sends: str = "all") -> bytes:
+        """Hash (8 bytes) of the run, the mode, what is sent, and the common knowledge. It is the same for all agents of a run; no private
+        data enters."""
         settings = self.settings.model_dump(mode="json", include={"protocol", "smoothing"})
         settings["protocol"]["kind"] = settings["protocol"]["kind"] or RUNS[mode]
         common = {
@@ -153,7 +154,7 @@ class Part:
             "hops": self.hops, "center": self.center.tolist(), "reach": self.reach, "extent": self.extent, "convex": self.convex,
             "exact": self.exact,
             "settings": settings,
-        } | ({"generation": self.generation} if self.generation else {})  # fmt: skip
+        } | ({} if sends == "all" else {"sends": sends}) | ({"generation": self.generation} if self.generation else {})  # fmt: skip
         return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).digest()[:8]
 
     def without(self, gone: Collection[str]) -> Part:

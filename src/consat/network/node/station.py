@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from typing import Any, Final, Literal
 
@@ -15,9 +16,12 @@ from consat.network.node.body import Body
 from consat.network.node.core import LARGEST, Embodied, Look, Moment, Rows
 from consat.network.node.membership import Membership
 from consat.network.node.neighbours import Peers
+from consat.network.node.pair_core import PairCore
+from consat.network.node.pairs import Letter, halves, whole
 from consat.network.node.part import Part
+from consat.network.node.sieve import Sieve
 from consat.network.transports import Transport
-from consat.network.wire import Expected, Kind, Message, Numbers
+from consat.network.wire import VERSION, Expected, Kind, Message, Numbers, Reason
 from consat.numerics import float64
 from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.schedule import Schedule
@@ -46,6 +50,7 @@ class Station:
         log: function that takes events (JSON-serialisable data).
         frames: number of rounds in a message.
         stamped: whether a message contains the number of its round.
+        beat: number of silent steps after which an agent that sends only news repeats itself; None if it sends everything.
         give_up: silence of a neighbour, s, after which it counts as having left for good.
         report: time between two reports, s; 0 reports after each step.
         wall: Unix time, s, which the agents of a team share.
@@ -64,17 +69,27 @@ class Station:
         log: Log,
         frames: int = 1,
         stamped: bool = False,
+        beat: float | None = None,
         give_up: float = np.inf,
         report: float = REPORT,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
         self.membership = Membership(part)
+        self._beat, self._sieve = beat, None if beat is None else Sieve(core, beat)
+        self._letters = {} if beat is None else _brief(part, core)
         self.peers = Peers(
             part,
-            part.problem(mode),
+            part.problem(mode, "all" if beat is None else "events"),
             {
-                neighbour.id: _expected(len(neighbour.shares), core.largest, core.letters[neighbour.id], frames, stamped)
+                neighbour.id: _expected(
+                    len(neighbour.shares),
+                    core.largest,
+                    self._letters.get(neighbour.id) or (core.letters[neighbour.id],),
+                    frames,
+                    stamped,
+                    same=stamped and beat is not None,
+                )
                 for neighbour in part.neighbours
             },
             transport,
@@ -84,6 +99,7 @@ class Station:
         self._log, self._give_up, self._period = log, give_up, report
         self.epoch, self._wall = part.epoch, wall
         self._time, self._restarts = 0.0, 0
+        self._strange = False
         self._born = clock()
         self._track: list[list[float]] = []
         self._known: Knowledge = None
@@ -116,6 +132,7 @@ class Station:
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
             before, self.core = self.core, self.core.among(gone)
+            self._sieve = None if self._beat is None else Sieve(self.core, self._beat)
             self._gone, self._look = gone, None
             if state is not None:
                 state = self.core.carry(before, state, self.among(first), self._time)
@@ -194,6 +211,7 @@ class Station:
         else:
             self.part = replace(self.part, team=changed(team, changes))
             self.core = before.among(self._gone, self.part)
+            self._sieve = None if self._beat is None else Sieve(self.core, self._beat)
             state = state and self.core.carry(before, state, self.among(self.first()), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state
@@ -208,8 +226,11 @@ class Station:
     def hear(self) -> list[Message]:
         """The received messages, after an update of the membership with them."""
         messages = self.peers.hear()
+        if not self._strange and self.peers.dropped.get(Reason.VERSION):
+            self._strange = True
+            self.log("refused", why=f"a neighbour speaks another version of the wire format than {VERSION}; update the team as a whole")
         for message in messages:
-            if message.kind is not Kind.GOODBYE:
+            if message.kind not in (Kind.GOODBYE, Kind.SAME):
                 shares = self.peers.all[message.source].known.shares
                 epochs = message.arrays[0] if message.kind is Kind.HELLO else message.arrays[0][:, -1]
                 self.membership.hear(shares, epochs)
@@ -238,7 +259,8 @@ class Station:
             letter, row = np.zeros(self.core.letters[neighbour].shape), self._turn_of.get(neighbour)
             if row is not None:
                 letter = outbox.pair[row, : len(letter)]
-            told[neighbour] = [block, letter]
+            short = self._letters.get(neighbour)
+            told[neighbour] = [block, *([letter] if short is None else halves(letter, 1 + short[0].shape[0]))]
         return told
 
     def empty(self) -> tuple[Rows, Rows]:
@@ -251,11 +273,12 @@ class Station:
 
         Args:
             neighbour: id of the sender.
-            told: [block, letter]; see `blocks`.
+            told: [block, letter], or [block, letter in 32 bits, its proof]; see `blocks`.
             inbox: rows of the messages; modified.
             arrived: masks of arrival; modified.
         """
-        block, letter = told
+        block, *letters = told
+        letter = letters[0] if len(letters) == 1 else whole(*letters)
         place, row = self._places[neighbour], self._turn_of.get(neighbour)
         same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
         agrees = (place >= 0) & same
@@ -275,15 +298,45 @@ class Station:
             self.log("anew")
         return done.state, done.outbox, done.look
 
+    def sift(self, rows: Rows) -> tuple[Rows, AbstractSet[str]]:
+        """What the neighbours hold after this turn, and who has to be told for that: all, where all is sent."""
+        if self._sieve is None:
+            return rows, self.peers.all.keys()
+        rows, goes = self._sieve.sift(rows)
+        return rows, self.peers.all.keys() - {self.present[k] for k in np.flatnonzero(~goes)}
+
+    def resume(self, rows: Rows, state: Any) -> None:
+        """Go on after rows that were said before a restart, with the state of then."""
+        if self._sieve is not None:
+            self._sieve.resume(rows, np.asarray(state.bodies.position))
+
+    def same(self, told: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """What a neighbour says by silence where nothing gets lost, given what it said a round ago."""
+        block = told[0].copy()
+        for column in self.core.ages:
+            block[:, column] += block[:, column] > 0
+        return [block, *told[1:]]
+
+    def say_same(self, number: np.ndarray, to: Iterable[str]) -> None:
+        """Say that a round brought no news."""
+        for neighbour in to:
+            self.peers.say(neighbour, Kind.SAME, [number])
+
     def greet(self) -> None:
         """Send a greeting, which contains the membership, to the neighbours."""
         for neighbour in self._listeners():
             self.peers.say(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
-    def say(self, arrays: Mapping[str, list[np.ndarray]], to: list[str] | None = None) -> None:
-        """Send a state message to all neighbours that are present, or to those in `to`. `arrays`: see `blocks`."""
+    def say(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
+        """Send a state message to all neighbours that are present, or to those in `to`. `arrays`: see `blocks`; `among`: limits both."""
         for neighbour in self._listeners() if to is None else to:
-            self.peers.say(neighbour, Kind.STATE, arrays[neighbour])
+            if among is None or neighbour in among:
+                single = [k for k, array in enumerate(arrays[neighbour]) if neighbour in self._letters and k % 3 == 1]
+                self.peers.say(neighbour, Kind.STATE, arrays[neighbour], tuple(single))
+
+    def silent(self, among: AbstractSet[str]) -> list[str]:
+        """The neighbours that are not among those who are told."""
+        return [neighbour for neighbour in self._listeners() if neighbour not in among]
 
     def goodbye(self) -> None:
         """Send a goodbye: the process stops. An agent that leaves for good announces that in earlier messages."""
@@ -433,11 +486,21 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _expected(shares: int, largest: np.ndarray, letter: Numbers, frames: int, stamped: bool) -> Expected:
+def _expected(
+    shares: int, largest: np.ndarray, letters: Sequence[Numbers], frames: int, stamped: bool, *, same: bool
+) -> Expected:  # fmt: skip
     """Expected arrays of a neighbour's messages. The last number of each row is a membership number."""
-    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), letter]
-    return {
+    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *letters]
+    found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {
         Kind.HELLO: [(shares,)],
         Kind.STATE: [*frame * frames, *[(1,)] * stamped],
         Kind.GOODBYE: [],
     }
+    return found | ({Kind.SAME: [(1,)]} if same else {})
+
+
+def _brief(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
+    """The halves of what is said to each neighbour as a whole, if anything is."""
+    if not isinstance(core.core, PairCore):
+        return {}
+    return {neighbour.id: Letter.of(neighbour, part.team.dimension).brief() for neighbour in part.neighbours}

@@ -113,6 +113,7 @@ class Plan:
         member: (M,) index of the result for each constraint, family after family.
         pair: (P,) index of the result for each end of a link.
         floats: (P,) number of floats in a message over each end of a link.
+        singles: (P,) number of those floats that may be sent in 32 bits.
         width: largest number of scalar variables that two neighbours share.
         exact: whether the agents can prove a bound: all used links form a tree, so that no information returns to its sender through
             others, and no constraint moves.
@@ -124,6 +125,7 @@ class Plan:
     member: Array
     pair: Array
     floats: Array
+    singles: Array
     width: int = field(metadata={"static": True})
     exact: bool = field(metadata={"static": True})
 
@@ -320,7 +322,7 @@ def plan_of(team: Team, copies: Estimates, shared: Shared) -> Plan:
     floats = size * (size + 3) // 2 + 4 + places * (places + 3) // 2 + 3
     return Plan(
         tuple(made), where["rows"], where["agents"], where["members"], where["pairs"],
-        on_device(floats), int(size.max(initial=1)), shared.exact and not team.moves,
+        on_device(floats), on_device(size * (size + 3) // 2 + 3), int(size.max(initial=1)), shared.exact and not team.moves,
     )  # fmt: skip
 
 

@@ -1,0 +1,112 @@
+"""For whom an agent has news, where it sends nothing else: `consat.protocols.sending`, over the rows that it says."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from consat.network.node.core import Embodied, RoundCore, Rows
+from consat.network.node.pair_core import PairCore
+from consat.numerics import quick_compilation
+from consat.protocols import Rounds, sending
+from consat.protocols.agreement import NEVER, Word
+from consat.protocols.sending import Crossing, Held
+
+
+class Said(NamedTuple):
+    """What an agent remembers of what it said.
+
+    Attributes:
+        rows: what the neighbours hold.
+        since: see `consat.protocols.sending.Held`.
+        place: likewise.
+    """
+
+    rows: Rows
+    since: np.ndarray
+    place: np.ndarray
+
+
+class Sieve:
+    """Of one core.
+
+    Args:
+        core: whose rows they are.
+        beat: turns after which it repeats itself; ∞ where nothing gets lost, and silence says that all is as before.
+    """
+
+    def __init__(self, core: Embodied, beat: float) -> None:
+        inner = core.core
+        assert isinstance(inner, RoundCore | PairCore), "of a protocol in rounds"
+        self._core, self._inner, self._beat = core, inner, beat
+        order = [neighbour.id for neighbour in core.part.neighbours]
+        self._pair = jnp.asarray(np.array([order.index(neighbour) for neighbour, _ in core.ends], dtype=np.int32))
+        shape = core.part.team.dimension, inner.width, len(order)
+        self._how = _How(inner.protocol, inner.layout if isinstance(inner, RoundCore) else None, shape, not np.isfinite(beat))
+        self._packing = inner.packing if isinstance(inner, PairCore) else None
+        empty, _ = core.empty()
+        self._said = Said(empty, np.full(len(order), NEVER), np.zeros((len(core.ends), shape[0])))
+
+    def resume(self, rows: Rows, bodies: np.ndarray) -> None:
+        """Go on after what was said last; bodies: (rows, d) where they were then."""
+        place = np.asarray(self._core.core.solver.links.at(jnp.asarray(bodies)))
+        self._said = Said(rows, np.ones(len(self._said.since)), place)
+
+    def sift(self, rows: Rows) -> tuple[Rows, np.ndarray]:
+        """What the neighbours hold after this turn, and (G,) to whom it has to be sent for that."""
+        found = _compiled()(self._how, self._inner.solver, self._packing, rows, self._said, (self._pair, self._beat))
+        link, pair, since, place, goes = map(np.asarray, found)
+        self._said = Said(Rows(link, pair), since, place)
+        return self._said.rows, goes
+
+
+class _How(NamedTuple):
+    """What a program is compiled for: protocol, structure of its message, dimension, width of its rows, neighbours, and whether silence
+    says that all is as before."""
+
+    protocol: Rounds
+    layout: Any
+    shape: tuple[int, int, int]
+    lasting: bool
+
+
+def _crossing(how: _How, solver: Any, packing: Any, rows: Rows) -> Crossing:
+    d, width, _ = how.shape
+    link = jnp.asarray(rows.link)
+    word = Word(link[:, width : width + d], link[:, width + d], link[:, width + d + 1])
+    if packing is not None:
+        return Crossing(packing.unpack(jnp.asarray(rows.pair), solver.interior.plan.width), jnp.zeros(len(link)), word)
+    return Crossing(how.layout.unpack(link), link[:, width - 1], word)
+
+
+def _rows(how: _How, packing: Any, crossing: Crossing, pair: Array) -> tuple[Array, Array]:
+    word, count = crossing.word, len(crossing.told)
+    assert word is not None
+    bodies = [word.position, word.stale[:, None], word.age[:, None]]
+    if packing is not None:
+        return jnp.concatenate(bodies, axis=1), packing.pack(crossing.message)
+    leaves = [leaf.reshape(count, size) for leaf, size in zip(jax.tree.leaves(crossing.message), how.layout.sizes, strict=True)]
+    return jnp.concatenate([*leaves, crossing.told[:, None], *bodies], axis=1), pair
+
+
+def _sift(
+    how: _How, solver: Any, packing: Any, rows: Rows, said: Said, to: tuple[Array, Array]
+) -> tuple[Array, ...]:  # fmt: skip
+    pair, beat = to
+    new, old = (_crossing(how, solver, packing, each) for each in (rows, said.rows))
+    held = Held(old, jnp.asarray(said.since), jnp.asarray(said.place))
+    crossing, held, goes = sending.sifted(how.protocol, solver, new, held, pair, beat=beat, lasting=how.lasting)
+    link, mail = _rows(how, packing, crossing, jnp.asarray(rows.pair))
+    assert held.place is not None
+    return link, mail, held.since, held.place, goes
+
+
+@functools.cache
+def _compiled() -> Callable[..., Any]:
+    return jax.jit(_sift, static_argnames=("how",), compiler_options=quick_compilation())
