@@ -25,7 +25,8 @@ from families import FAMILIES
 from rounds import machine, table
 
 import consat as cs
-from consat.engine.round import SATISFIED, Weather, begin, many_rounds, world_of
+from consat.engine.round import SATISFIED, begin, many_rounds, world_of
+from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.units import scale
 from consat.protocols import ROUNDS
@@ -107,7 +108,7 @@ def runs(kind: Kind, count: int, way: tuple[str, str], seeds: int, rounds: int) 
         ready = Prepared.of(team, settings)
         made = ROUNDS[protocol]()
         world = world_of(
-            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=Weather(), body=None,
+            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, faults=Faults(), body=None,
             speaks=made.speaks, events=sends == "events",
         )  # fmt: skip
         seen = program()(made, world, jnp.asarray(ready.first()), jnp.arange(float(rounds)))

@@ -33,8 +33,9 @@ from scipy.optimize import minimize
 from consat.certify.certificate import bounds
 from consat.certify.optimum import cluster_margins, max_min
 from consat.certify.quadratics import values_and_gradients
-from consat.engine.round import Weather, World, begin, many_rounds, world_of
+from consat.engine.round import World, begin, many_rounds, world_of
 from consat.engine.rounds import HOLD
+from consat.faults import Faults
 from consat.numerics import Groups, float64, quick_compilation
 from consat.problem.objective import Nu, Objective, Schedule
 from consat.problem.units import Scale, automatic, scale
@@ -136,9 +137,9 @@ class Stage:
         return cls(problem, copies, nu, size, copies.cluster, best, smooth, center)
 
     def world(self, *, rough: bool, protocol: Rounds, copies: Estimates) -> World:
-        weather = Weather(loss=0.5 if rough else 0.0)
+        faults = Faults(loss=0.5 if rough else 0.0)
         return world_of(
-            self.problem.team, copies, self.nu, self.size, convex=self.problem.convex, weather=weather, body=None, speaks=protocol.speaks
+            self.problem.team, copies, self.nu, self.size, convex=self.problem.convex, faults=faults, body=None, speaks=protocol.speaks
         )
 
     def layout(self, name: str) -> Estimates:
@@ -259,7 +260,7 @@ def measure_peers(stage: Stage, boxes: Sequence[float], cap: int, steps: np.ndar
     """The sampled flow and gradient methods, with the paper's ramp and with constant ν, each at its best step for each box."""
     problem = stage.problem
     groups, observer = Groups.of(stage.cluster, problem.seeds), Objective.at_positions(problem.team)
-    world = stage.world(rough=False)
+    world = stage.world(rough=False, protocol=ROUNDS["admm"](), copies=stage.copies)  # whoever speaks along links
     boxes = [box for box in boxes if box != NEAR or stage.center is not None]
     first = np.stack([stage.first(box, 0) for box in boxes])
     own = jnp.asarray(stage.copies.own)

@@ -35,6 +35,7 @@ from consat.certify.quadratics import shape_of
 from consat.engine import round as kernel
 from consat.engine.chunks import CHUNK
 from consat.engine.flows import Problem, rate
+from consat.faults import Faults
 from consat.numerics import float64, thorough_compilation
 from consat.problem.objective import Nu, Schedule
 from consat.problem.units import automatic, scale
@@ -107,7 +108,7 @@ def measure(name: str, count: int) -> Row:
     team, size = scenario.team, scale(scenario.team)
     copies, nu = Estimates.of(team, "local"), Schedule.of(automatic(size)).final
     convex = bool(shape_of(team).concave.all())
-    world = kernel.world_of(team, copies, nu, size, convex=convex, weather=kernel.Weather(), body=None)
+    world = kernel.world_of(team, copies, nu, size, convex=convex, faults=Faults(), body=None)
     first = jnp.asarray(first_estimates(team, copies, scenario.settings.start, size))
     build, begin = time.perf_counter() - begin, time.perf_counter()
     protocol = ROUNDS["admm"]()

@@ -34,6 +34,25 @@ with tempfile.TemporaryDirectory() as folder:
     path = cs.run("case-b", rounds=3).export(f"{folder}/run.jsonl")
     assert len(pathlib.Path(path).read_text().splitlines()) == 4
 """,
+    "A fault": """
+from consat.faults import Faults
+from consat.network.transports.memory import LATENCY, MemoryNetwork
+network = MemoryNetwork(Faults(deaf=2))
+one, other = network.endpoint("a", ["b"]), network.endpoint("b", ["a"])
+for payload in (b"1", b"2", b"3"): one.send("b", payload)
+network.now = LATENCY
+network.deliver()
+assert other.receive() == [b"3"]
+""",
+    "A transport": """
+from consat.network.transports.counted import Counted
+network = MemoryNetwork()
+one = Counted(network.endpoint("a", ["b"]))
+one.send("b", b"123")
+assert one.sent == 3
+import consat.network.deploy.process as process
+assert process.Counted is Counted
+""",
     "A figure": """
 import tempfile
 with tempfile.TemporaryDirectory() as folder:

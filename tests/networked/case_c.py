@@ -1,11 +1,14 @@
 """Case C of the paper, on which the tests of the network run: its optimum has gradients that don't vanish, so nothing is forgiven."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import Manner
 from consat.network.node.part import Part, split
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.scenario import load
 
 GOAL = {"a1": (1.10541, 0.0), "a2": (-0.49880, 0.0), "a3": (-1.10541, 0.0)}
@@ -24,9 +27,11 @@ def off(rehearsal: Rehearsal) -> float:
     return max(float(np.abs(positions[agent] - np.array(goal)).max()) for agent, goal in GOAL.items() if agent in positions)
 
 
-def rehearse(manner: Manner, conditions: Conditions | None = None, seed: int = 0, **options: object) -> Rehearsal:
+def rehearse(manner: Manner, conditions: Faults | None = None, seed: int = 0, **options: object) -> Rehearsal:
     """All three agents, started; in lockstep they run admm."""
-    made = Rehearsal(parts(*ADMM if manner.mode == "lockstep" else ()), manner, Air(conditions, seed), **options)  # type: ignore[arg-type]
+    made = Rehearsal(
+        parts(*ADMM if manner.mode == "lockstep" else ()), manner, MemoryNetwork(replace(conditions or Faults(), seed=seed)), **options
+    )  # type: ignore[arg-type]
     made.start()
     return made
 

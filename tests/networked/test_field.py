@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 
 from consat.errors import InvalidSettings
+from consat.faults import Faults
 from consat.network.deploy import process
-from consat.network.deploy.process import Circumstances, run_agent
+from consat.network.deploy.process import ProcessOptions, run_agent
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.body import VALID
 from consat.network.node.helm import PERIOD
 from consat.network.node.modes import Manner
 from consat.network.node.part import Part, split
 from consat.network.node.station import Station
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import float64
 from consat.problem.objective import Objective
 from consat.scenario import load, loads
@@ -50,7 +51,7 @@ def margin(positions: dict[str, np.ndarray]) -> float:
 @pytest.mark.parametrize("mode", MODES)
 def test_agents_are_satisfied_when_their_bodies_are(mode: str) -> None:
     """The estimates satisfy everything within tenths of a second, the bodies need some ten."""
-    team = rehearse(MODES[mode], Conditions(loss=0.3), speed=SPEED)
+    team = rehearse(MODES[mode], Faults(loss=0.3), speed=SPEED)
     team.run(30.0, lambda: bool(events(team, "satisfied")))
     assert margin(team.positions()) > 0
     early = [event for event in events(team, "report") if event["estimate_margin"] is not None and event["t"] < 5.0]  # type: ignore[operator]
@@ -84,7 +85,9 @@ agents:
 communication: {graph: line}
 smoothing: {nu_alpha: 5, nu_beta: 5}
 """)
-    team = Rehearsal(split(scenario, run="relays"), Manner("admm", report=0.0), Air(Conditions(loss=0.3, delay=(0.0, 0.05))), speed=1.0)
+    team = Rehearsal(
+        split(scenario, run="relays"), Manner("admm", report=0.0), MemoryNetwork(Faults(loss=0.3, delay=(0.0, 0.05))), speed=1.0
+    )
     team.start()
     team.run(20.0, lambda: bool(events(team, "satisfied")))
     where = team.positions()
@@ -163,7 +166,7 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
 
     @contextmanager
     def transport(*_: Any) -> Iterator[Any]:
-        yield Waiting(Air().endpoint("solo", []))
+        yield Waiting(MemoryNetwork().endpoint("solo", []))
 
     monkeypatch.setattr(process, "_write", made.take)
     monkeypatch.setattr(process, "_transport", transport)
@@ -189,7 +192,7 @@ def run(again: Callable[[], Part] | None = None, **around: Any) -> None:
     run_agent(
         part,
         Manner("admm", around.pop("rate", 20.0), turns=around.pop("turns", None)),
-        Circumstances(**{"sensor": "stdin", "speed": 0.5, "until": PATIENCE} | around),
+        ProcessOptions(**{"sensor": "stdin", "speed": 0.5, "until": PATIENCE} | around),
         again,
     )
 
@@ -434,4 +437,4 @@ def test_one_on_standby_joins_when_told(robot: Robot) -> None:
 def test_constraints_that_move_need_somebody_to_say_when() -> None:
     moving = loads(SOLO.text.replace("[0, 0]", "{times: [0, 1], values: [[0, 0], [1, 1]]}"))
     with pytest.raises(InvalidSettings, match="nobody says when t = 0 is; say --epoch"):
-        run_agent(split(moving)["solo"], Manner("admm"), Circumstances())
+        run_agent(split(moving)["solo"], Manner("admm"), ProcessOptions())

@@ -3,19 +3,21 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
+from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard, pair_core
 from consat.network.node.core import Embodied, Moment
 from consat.network.node.modes import Manner, core_of
 from consat.network.node.pairs import HEAD, Letter, Packing
 from consat.network.node.part import split
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.network.wire import Message, encode
 from consat.numerics import float64
 from consat.scenario import load, loads
@@ -25,15 +27,15 @@ MANNER = Manner("interior-point", report=0.0)
 BEST = {"case-c": math.inf, "case-d": -0.0814394460511299}
 """The upper bound that `consat solve` proves of the best margin; of the feasible team nobody asks."""
 CONDITIONS = {
-    "perfect": Conditions(),
-    "loss": Conditions(loss=0.3),
-    "delay": Conditions(delay=(0.05, 0.2)),
-    "all": Conditions(loss=0.3, delay=(0.0, 0.05), repeat=0.3),
+    "perfect": Faults(),
+    "loss": Faults(loss=0.3),
+    "delay": Faults(delay=(0.05, 0.2)),
+    "all": Faults(loss=0.3, delay=(0.0, 0.05), repeat=0.3),
 }
 
 
-def team_of(name: str, conditions: Conditions | None = None, seed: int = 0, **options: Any) -> Rehearsal:
-    return Rehearsal(split(load(name), run=name, **options), MANNER, Air(conditions, seed))
+def team_of(name: str, conditions: Faults | None = None, seed: int = 0, **options: Any) -> Rehearsal:
+    return Rehearsal(split(load(name), run=name, **options), MANNER, MemoryNetwork(replace(conditions or Faults(), seed=seed)))
 
 
 def known(team: Rehearsal) -> dict[str, tuple[str | None, bool]]:
@@ -79,27 +81,27 @@ def test_all_agents_know_what_is_so(name: str, what: str, how: str) -> None:
 @pytest.mark.parametrize(("name", "what"), [("case-c", "satisfied"), ("case-d", "infeasible")])
 def test_survives_a_crash_without_memory_and_a_partition(name: str, what: str) -> None:
     """Who crashed begins at its body with nothing in its inbox. Nobody says that all are satisfied, or near, of those it does not hear."""
-    team = team_of(name, Conditions(loss=0.3))
+    team = team_of(name, Faults(loss=0.3))
     team.start()
     wait(team, what)
     team.kill("a2")
     team.run(1.0)
     assert {told for _, told in known(team).values()} == {False}
     assert {word for word, _ in known(team).values()} == {None if name == "case-c" else "infeasible"}  # which stays so
-    team.bodies["a2"].follow(np.array([30.0, -40.0]), team.air.now)
+    team.bodies["a2"].follow(np.array([30.0, -40.0]), team.network.now)
     team.start("a2")
     wait(team, what)
-    team.air.partition({"a1"}, {"a2", "a3"})
+    team.network.partition({"a1"}, {"a2", "a3"})
     team.run(1.0)
     assert {told for _, told in known(team).values()} == {False}
-    team.air.partition()
+    team.network.partition()
     wait(team, what)
     assert_no_false_word(team, name)
 
 
 def test_one_without_neighbours_knows_by_itself() -> None:
     lines = "{kind: within, center: [0, 0], radius: 1}, {kind: within, center: [4, 0], radius: 1}"
-    team = Rehearsal(split(loads(f"consat: 1\nagents:\n  - {{id: a, constraints: [{lines}]}}\n"), run="solo"), MANNER, Air())
+    team = Rehearsal(split(loads(f"consat: 1\nagents:\n  - {{id: a, constraints: [{lines}]}}\n"), run="solo"), MANNER, MemoryNetwork())
     team.start()
     wait(team, "infeasible")
     assert min(bounds(team)) >= -3.0  # halfway, 1 − 2²
@@ -109,7 +111,7 @@ def test_one_without_neighbours_knows_by_itself() -> None:
 def test_a_proof_ends_with_the_team_that_it_is_of(how: str) -> None:
     """a3 makes case D infeasible. When it has gone, a1, which holds no copy of its position, and is not told that it has, must forget
     what was proven; when it is back, it is so again."""
-    team = team_of("case-d", Conditions(loss=0.3))
+    team = team_of("case-d", Faults(loss=0.3))
     team.start(give_up=2.0 if how == "give-up" else math.inf)
     wait(team, "infeasible")
     if how == "leave":
@@ -120,7 +122,7 @@ def test_a_proof_ends_with_the_team_that_it_is_of(how: str) -> None:
         team.kill("a3")
         team.run(2.5)
     assert {event["id"] for event in events(team, "left")} == {"a2"}
-    since = team.air.now
+    since = team.network.now
     wait(team, "satisfied")
     team.run(0.5)
     assert set(known(team)) == {"a1", "a2"}
@@ -154,17 +156,17 @@ def test_a_proof_of_another_team_is_not_used() -> None:
 
 
 def test_one_that_was_absent_joins() -> None:
-    team = team_of("case-d", Conditions(loss=0.3), absent=("a3",))
+    team = team_of("case-d", Faults(loss=0.3), absent=("a3",))
     team.start("a1", "a2")
     wait(team, "satisfied")
     assert not events(team, "infeasible")
     team.start("a3")
     wait(team, "infeasible")
-    assert min(bounds(team, team.air.now)) >= BEST["case-d"]
+    assert min(bounds(team, team.network.now)) >= BEST["case-d"]
 
 
 def test_lockstep_survives_a_departure() -> None:
-    team = Rehearsal(split(load("case-d"), run="lockstep"), Manner("lockstep", rate=100.0, report=0.0), Air(Conditions(loss=0.3)))
+    team = Rehearsal(split(load("case-d"), run="lockstep"), Manner("lockstep", rate=100.0, report=0.0), MemoryNetwork(Faults(loss=0.3)))
     team.start()
     wait(team, "infeasible")
     team.runners["a3"].leave()
@@ -185,7 +187,7 @@ def forge(team: Rehearsal, source: str, victim: str, change: Change) -> None:
     assert last.arrays
     mail = last.arrays[1].copy()
     change(mail, Letter.of(known, 2))
-    team.air._open[victim].queue.append(encode(_next(last, mail)))
+    team.network._open[victim].queue.append(encode(_next(last, mail)))
 
 
 def _next(last: Message, mail: np.ndarray) -> Message:
@@ -290,7 +292,7 @@ def test_a_lie_that_makes_sense_does_no_lasting_harm(satisfied: Rehearsal, lie: 
     satisfied.run(2.0 * pair_core.FORGET / 100.0 + 0.5 if hopeless else 5.0)
     wait(satisfied, "satisfied", 0.0)
     assert all(np.isfinite(place).all() for place in satisfied.positions().values())
-    assert min(bounds(satisfied, satisfied.air.now - 0.05)) > 0
+    assert min(bounds(satisfied, satisfied.network.now - 0.05)) > 0
     assert not events(satisfied, "anew")
 
 

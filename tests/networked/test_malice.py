@@ -39,7 +39,7 @@ def forge(team: Rehearsal, source: str, victim: str, change: Callable[[Message],
     last = team.runners[victim].station.peers.all[source].last
     assert last is not None
     for number in range(1, times + 1):
-        team.air._open[victim].queue.append(encode(change(dataclasses.replace(last, sequence=last.sequence + number))))
+        team.network._open[victim].queue.append(encode(change(dataclasses.replace(last, sequence=last.sequence + number))))
 
 
 def numbers(value: float, columns: slice = slice(0, -1)) -> Callable[[Message], Message]:

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 import consat as cs
 from consat.errors import InvalidSettings, InvalidTeam
+from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import Manner, Mode
 from consat.network.node.orders import KEYS, Orders, order_of
 from consat.network.node.part import read_part, split, write_part
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import CompileClock
 from consat.problem.changes import changes_of
 from consat.problem.objective import margins
@@ -41,10 +42,10 @@ FUZZED = loads(STILL).team
 APART = STILL.replace("center: [0, 0]", "center: [20, 0]")
 
 
-def team_of(text: str, mode: Mode = "interior-point", conditions: Conditions | None = None, **options: Any) -> Rehearsal:
+def team_of(text: str, mode: Mode = "interior-point", conditions: Faults | None = None, **options: Any) -> Rehearsal:
     scenario = loads(text + ("protocol: {kind: admm}\n" if mode == "admm" else ""))
     parts = split(scenario, run="online", epoch=options.pop("epoch", 0.0))
-    made = Rehearsal(parts, Manner(mode, rate=options.pop("rate", 50.0), report=0.0), Air(conditions), **options)
+    made = Rehearsal(parts, Manner(mode, rate=options.pop("rate", 50.0), report=0.0), MemoryNetwork(conditions), **options)
     made.start()
     return made
 
@@ -71,7 +72,7 @@ def bounds(team: Rehearsal, since: float = 0.0) -> list[float]:
 
 def bounds_below(team: Rehearsal, text: str) -> list[float]:
     """What is said in the next moments and is false of a team: bounds below the best margin, which is proven from below."""
-    best, since = cs.solve(loads(text))["bounds"][0], team.air.now
+    best, since = cs.solve(loads(text))["bounds"][0], team.network.now
     team.run(0.3)
     return [bound for bound in bounds(team, since) if bound < best - 1e-9]
 
@@ -79,7 +80,7 @@ def bounds_below(team: Rehearsal, text: str) -> list[float]:
 @pytest.mark.parametrize("mode", ["interior-point", "admm"])
 def test_agents_follow_constraints_that_move_by_clocks_that_differ(mode: Mode) -> None:
     """The goal goes at 1.1 a second, so that clocks 50 ms apart place it 0.06 apart. Nobody proves anything of what does not stay."""
-    team = team_of(ESCORT, mode, Conditions(loss=0.3), skew={"a1": 0.05, "a3": -0.05})
+    team = team_of(ESCORT, mode, Faults(loss=0.3), skew={"a1": 0.05, "a3": -0.05})
     team.run(5.0)
     assert worst(team, ESCORT, 0.5, 5.0) > 0.3
     assert knows(team) == {"satisfied"}
@@ -108,7 +109,7 @@ def test_a_moving_part_is_written_and_read_with_its_clock() -> None:
 
 def test_lockstep_counts_time_in_rounds() -> None:
     """As `run` does, to rounding."""
-    team = team_of(ESCORT, "lockstep", Conditions(loss=0.3), rate=20.0, epoch=None)
+    team = team_of(ESCORT, "lockstep", Faults(loss=0.3), rate=20.0, epoch=None)
     team.run(2.6)
     result = cs.run(loads(ESCORT), rate=20.0, rounds=40)
     places = {(event["id"], int(row[0])): row[1:] for event in events(team, "report") for row in event["track"]}  # type: ignore[union-attr]
@@ -119,11 +120,11 @@ def test_lockstep_counts_time_in_rounds() -> None:
 def test_a_changed_constraint_counts_from_the_next_turn_and_compiles_nothing() -> None:
     """Infeasible, proven; not so any more, and satisfied; and proven again. No bound is false for the team that it is said of."""
     best = cs.solve(loads(APART))["bounds"][1]
-    team = team_of(APART, conditions=Conditions(loss=0.3))
+    team = team_of(APART, conditions=Faults(loss=0.3))
     team.run(8.0, lambda: knows(team) == {"infeasible"})
     assert knows(team) == {"infeasible"}
     with CompileClock() as clock:
-        changed_at = team.air.now
+        changed_at = team.network.now
         team.runners["a1"].change("goal", {"center": [0, 0]})
         team.run(8.0, lambda: knows(team) == {"satisfied"})
     assert clock.seconds["compile"] == 0.0

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from consat.errors import InvalidSettings, NetworkError
+from consat.faults import Channel, Faults
 from consat.network.deploy.dashboard import table
 from consat.network.deploy.environment import prepare
 from consat.network.deploy.observer import Observer
@@ -17,8 +18,8 @@ from consat.network.node.body import CONFIRMED, MeasuredBody, Measurement, Simul
 from consat.network.node.membership import Membership
 from consat.network.node.modes import Manner, core_of
 from consat.network.node.persistence import Store
-from consat.network.transports.faults import Weathered
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.faults import FaultyTransport
+from consat.network.transports.memory import LATENCY, MemoryNetwork
 from consat.scenario import load
 from tests.networked.case_c import parts
 
@@ -62,12 +63,12 @@ def test_a_store_refuses_the_file_of_another(tmp_path: Path) -> None:
 
 def test_the_air_delays_repeats_and_loses_by_seed() -> None:
     def run(seed: int) -> list[bytes]:
-        air = Air(Conditions(loss=0.3, delay=(0.0, 1.0), repeat=0.2), seed)
-        a, b = air.endpoint("a", ["b"]), air.endpoint("b", ["a"])
+        network = MemoryNetwork(Faults(loss=0.3, delay=(0.0, 1.0), repeat=0.2, seed=seed))
+        a, b = network.endpoint("a", ["b"]), network.endpoint("b", ["a"])
         for k in range(1000):
             a.send("b", b"%d" % k)
-        air.now = 1.0
-        air.deliver()
+        network.now = 1.0
+        network.deliver()
         return b.receive()
 
     got = run(0)
@@ -78,37 +79,51 @@ def test_the_air_delays_repeats_and_loses_by_seed() -> None:
 
 
 def test_nothing_passes_a_partition_nor_reaches_whom_one_is_not_linked_to() -> None:
-    air = Air()
-    ends = {agent: air.endpoint(agent, others) for agent, others in (("a", "b"), ("b", "ac"), ("c", "b"))}
-    air.partition({"a"}, {"b", "c"})
+    network = MemoryNetwork()
+    ends = {agent: network.endpoint(agent, others) for agent, others in (("a", "b"), ("b", "ac"), ("c", "b"))}
+    network.partition({"a"}, {"b", "c"})
     ends["a"].send("b", b"1")
     ends["b"].send("c", b"2")
     ends["a"].send("c", b"3")
-    air.now = 1.0
-    assert air.deliver() == {"c"}
+    network.now = 1.0
+    assert network.deliver() == {"c"}
     assert ends["c"].receive() == [b"2"]
     assert (ends["a"].alive(), ends["b"].alive()) == (frozenset(), frozenset("c"))
-    air.partition()
+    network.partition()
     assert ends["a"].alive() == frozenset("b")
     ends["b"].close()
     assert ends["a"].alive() == frozenset()
 
 
-def test_weather_holds_back_and_loses() -> None:
-    air = Air(Conditions(delay=(0.0, 0.0)))
-    a, b = air.endpoint("a", ["b"]), Weathered(air.endpoint("b", ["a"]), air.clock, loss=0.25, delay=(1.0, 2.0), seed=3)
+def test_faults_hold_back_and_lose() -> None:
+    network = MemoryNetwork(Faults(delay=(0.0, 0.0)))
+    a, b = (
+        network.endpoint("a", ["b"]),
+        FaultyTransport(network.endpoint("b", ["a"]), network.clock, Faults(loss=0.25, delay=(1.0, 2.0), seed=3)),
+    )
     for k in range(400):
         a.send("b", b"%d" % k)
-    air.deliver()
+    network.now = LATENCY
+    network.deliver()
     assert b.receive() == []
-    air.now = 0.99
+    network.now = 0.99
     assert b.receive() == []
-    air.now = 1.5
+    network.now = LATENCY + 1.5
     early = b.receive()
-    air.now = 2.0
+    network.now = LATENCY + 2.0
     late = b.receive()
     assert len(early) + len(late) == pytest.approx(300, abs=40)
     assert len(early) == pytest.approx(150, abs=40)
+
+
+def test_losses_come_in_bursts() -> None:
+    channel = Channel(Faults(burst=(0.02, 0.1)), np.random.default_rng(0))
+    lost = np.array([not channel.delays() for _ in range(20_000)])
+    starts = np.flatnonzero(np.diff(lost.astype(int)) == 1)
+    assert lost.mean() == pytest.approx(0.02 / 0.12, abs=0.02)  # p / (p + q)
+    assert lost.sum() / len(starts) == pytest.approx(10, abs=1)  # 1 / q
+    with pytest.raises(InvalidSettings, match="must be two probabilities"):
+        Faults(burst=(0.5, 1.5))
 
 
 # -- membership --------------------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.core import Embodied, Kept, Moment, Rows, Turned
 from consat.network.node.link_core import LinkCore, LinkState
@@ -19,7 +20,7 @@ from consat.network.node.modes import Manner, Runner
 from consat.network.node.paced import Paced
 from consat.network.node.part import split
 from consat.network.node.station import Station
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import float64
 from consat.scenario import loads
 from tests.networked.case_c import ADMM, events, off, parts, rehearse
@@ -60,15 +61,15 @@ def test_lockstep_equals_simulate_bit_for_bit() -> None:
 
 @pytest.mark.parametrize(
     "conditions",
-    [Conditions(), Conditions(loss=0.3), Conditions(delay=DELAYS), Conditions(loss=0.3, delay=(0.0, 0.02), repeat=0.3)],
+    [Faults(), Faults(loss=0.3), Faults(delay=DELAYS), Faults(loss=0.3, delay=(0.0, 0.02), repeat=0.3)],
     ids=["perfect", "loss", "delay", "all"],
 )
-def test_finds_the_optimum(mode: str, conditions: Conditions) -> None:
+def test_finds_the_optimum(mode: str, conditions: Faults) -> None:
     assert arrive(rehearse(MODES[mode], conditions), mode) < 1e-3
 
 
-@pytest.mark.parametrize("conditions", [Conditions(), Conditions(loss=0.3)], ids=["perfect", "loss"])
-def test_survives_a_crash_without_memory(mode: str, conditions: Conditions) -> None:
+@pytest.mark.parametrize("conditions", [Faults(), Faults(loss=0.3)], ids=["perfect", "loss"])
+def test_survives_a_crash_without_memory(mode: str, conditions: Faults) -> None:
     team = rehearse(MODES[mode], conditions)
     team.run(1.0)
     team.kill("a2")
@@ -79,7 +80,7 @@ def test_survives_a_crash_without_memory(mode: str, conditions: Conditions) -> N
 
 
 def test_lockstep_survives_a_crash_without_memory() -> None:
-    team = rehearse(Manner("lockstep"), Conditions(loss=0.3, delay=(1e-3, 4e-3)))
+    team = rehearse(Manner("lockstep"), Faults(loss=0.3, delay=(1e-3, 4e-3)))
     team.run(0.5)
     team.kill("a2")
     team.run(0.5)
@@ -94,22 +95,22 @@ def test_lockstep_survives_a_crash_without_memory() -> None:
 def test_heals_after_a_partition(mode: str) -> None:
     team = rehearse(MODES[mode])
     team.run(0.1)
-    team.air.partition({"a1"}, {"a2", "a3"})
+    team.network.partition({"a1"}, {"a2", "a3"})
     team.run(PATIENCE[mode])
     assert off(team) > 0.05  # what follows is not there already
-    team.air.partition()
+    team.network.partition()
     assert arrive(team, mode) < 1e-3
 
 
 def test_lockstep_waits_through_a_partition() -> None:
     team = rehearse(Manner("lockstep", turns=150))
     team.run(0.002)
-    team.air.partition({"a1"}, {"a2", "a3"})
+    team.network.partition({"a1"}, {"a2", "a3"})
     team.run(5.0)
     reached = {event["id"]: event["track"][-1][0] for event in events(team, "report") if event["track"]}
     assert max(reached.values()) - min(reached.values()) <= 2
     assert max(reached.values()) < 150
-    team.air.partition()
+    team.network.partition()
     team.run(5.0)
     assert off(team) < 1e-3
 
@@ -127,7 +128,7 @@ def assert_optimal_without_a3(team: Rehearsal, how: str) -> None:
 
 @pytest.mark.parametrize("how", ["admm", "link", "lockstep"])
 def test_survivors_go_on_without_an_agent_that_leaves(how: str) -> None:
-    team = rehearse(MODES.get(how, Manner("lockstep")), Conditions(loss=0.3, delay=(1e-3, 2e-3)))
+    team = rehearse(MODES.get(how, Manner("lockstep")), Faults(loss=0.3, delay=(1e-3, 2e-3)))
     team.run(1.0)
     team.runners["a3"].leave()
     team.run(PATIENCE.get(how, 2.0))
@@ -152,7 +153,9 @@ def test_one_silent_for_too_long_counts_as_gone(how: str) -> None:
 @pytest.mark.parametrize("how", ["admm", "link", "lockstep"])
 def test_one_that_was_absent_joins(how: str) -> None:
     manner = MODES.get(how, Manner("lockstep"))
-    team = Rehearsal(parts(*ADMM if how == "lockstep" else (), absent=("a3",)), manner, Air(Conditions(loss=0.2, delay=(1e-3, 2e-3)), 1))
+    team = Rehearsal(
+        parts(*ADMM if how == "lockstep" else (), absent=("a3",)), manner, MemoryNetwork(Faults(loss=0.2, delay=(1e-3, 2e-3), seed=1))
+    )
     team.start("a1", "a2")
     team.run(PATIENCE.get(how, 2.0))
     assert_optimal_without_a3(team, how)
@@ -183,7 +186,7 @@ agents:
 communication: {graph: line}
 smoothing: {nu_alpha: 5, nu_beta: 5}
 """)
-    team = Rehearsal(split(scenario, run="relays"), Manner("admm"), Air(Conditions(loss=0.3)))
+    team = Rehearsal(split(scenario, run="relays"), Manner("admm"), MemoryNetwork(Faults(loss=0.3)))
     team.start()
     team.run(1.0)
     team.runners["a3"].leave()
@@ -214,7 +217,7 @@ def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
 
 
 def test_every_agent_learns_that_all_are_satisfied() -> None:
-    team = rehearse(Manner("admm"), Conditions(loss=0.3))
+    team = rehearse(Manner("admm"), Faults(loss=0.3))
     team.run(10.0, lambda: len({event["id"] for event in events(team, "satisfied")}) == 3)
     positions = np.array([team.positions()[agent] for agent in ("a1", "a2", "a3")])
     assert {event["id"] for event in events(team, "satisfied")} == {"a1", "a2", "a3"}
@@ -222,7 +225,7 @@ def test_every_agent_learns_that_all_are_satisfied() -> None:
 
 
 def test_no_agent_believes_what_is_not_so() -> None:
-    team = Rehearsal(split(_load("case-d"), run="d"), Manner("admm"), Air())
+    team = Rehearsal(split(_load("case-d"), run="d"), Manner("admm"), MemoryNetwork())
     team.start()
     team.run(5.0)
     assert not events(team, "satisfied")
@@ -244,7 +247,7 @@ def margin(name: str, positions: np.ndarray) -> float:
 def test_same_seed_same_run() -> None:
     runs = []
     for seed in (3, 3, 4):
-        team = rehearse(Manner("admm"), Conditions(loss=0.3, delay=DELAYS, repeat=0.1), seed)
+        team = rehearse(Manner("admm"), Faults(loss=0.3, delay=DELAYS, repeat=0.1), seed)
         team.run(2.0)
         runs.append(team.events)
     assert json.dumps(runs[0]) == json.dumps(runs[1]) != json.dumps(runs[2])
@@ -293,7 +296,7 @@ def test_the_flow_sampled_naively_goes_to_the_wrong_place() -> None:
     """And with its integral on the links, at the same rates and losses, it does not."""
     found = {}
     for core in (Naive, LinkCore):
-        team = rehearse(Manner("link"), Conditions(loss=0.3), build=sampled(core))
+        team = rehearse(Manner("link"), Faults(loss=0.3), build=sampled(core))
         team.run(100.0)
         found[core] = off(team)
     assert found[Naive] > 0.02

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from consat.errors import InvalidSettings
+from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import Manner
 from consat.network.node.part import split
-from consat.network.transports.memory import Air, Conditions
+from consat.network.transports.memory import MemoryNetwork
 from consat.network.wire import Kind, Message, encode
 from consat.scenario import load
 
 
-def rehearse(manner: Manner, conditions: Conditions = Conditions(), seed: int = 0) -> Rehearsal:  # noqa: B008
-    team = Rehearsal(split(load("case-c"), run="sends"), manner, Air(conditions, seed=seed))
+def rehearse(manner: Manner, conditions: Faults = Faults(), seed: int = 0) -> Rehearsal:  # noqa: B008
+    team = Rehearsal(split(load("case-c"), run="sends"), manner, MemoryNetwork(conditions, seed=seed))
     team.start()
     return team
 
@@ -31,8 +32,8 @@ def satisfied(team: Rehearsal) -> bool:
 
 
 @pytest.mark.parametrize("mode", ["interior-point", "admm"])
-@pytest.mark.parametrize("conditions", [Conditions(), Conditions(loss=0.3, delay=(0.0, 0.02))], ids=["perfect", "loss"])
-def test_all_know_and_then_only_hearts_beat(mode: Any, conditions: Conditions) -> None:
+@pytest.mark.parametrize("conditions", [Faults(), Faults(loss=0.3, delay=(0.0, 0.02))], ids=["perfect", "loss"])
+def test_all_know_and_then_only_hearts_beat(mode: Any, conditions: Faults) -> None:
     team = rehearse(Manner(mode, sends="events"), conditions)
     assert team.run(20.0, until=lambda: satisfied(team))
     team.run(20.0)
@@ -64,7 +65,7 @@ def test_lockstep_says_in_few_bytes_that_nothing_is_new() -> None:
 
 
 def test_agents_that_send_otherwise_are_not_understood() -> None:
-    team = Rehearsal(split(load("case-c"), run="sends"), Manner("interior-point"), Air())
+    team = Rehearsal(split(load("case-c"), run="sends"), Manner("interior-point"), MemoryNetwork())
     team.start("a1", "a3", sends="events")
     team.start("a2")
     team.run(1.0)
@@ -77,7 +78,7 @@ def test_another_version_is_refused_with_a_line() -> None:
     old = bytearray(encode(Message(Kind.GOODBYE, bytes(8), "a1", "a2", 1, 1, 0.0, np.nan, 0, 5.0)))
     old[4] = 3
     for _ in range(3):
-        team.air.endpoint("a1", ["a2"]).send("a2", bytes(old))
+        team.network.endpoint("a1", ["a2"]).send("a2", bytes(old))
         team.run(0.1)
     lines = [event["why"] for event in team.events if event["event"] == "refused" and "why" in event]
     assert lines == ["a neighbour speaks another version of the wire format than 4; update the team as a whole"]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.engine.round import Body, Seen, Weather, World, begin, many_rounds, world_of
+from consat.engine.round import Body, Seen, World, begin, many_rounds, world_of
+from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.objective import Schedule
 from consat.problem.team import Team
@@ -46,7 +47,7 @@ def follow(name: str, rounds: int, layout: str = "local", loss: float = 0.0) -> 
     copies, size = Estimates.of(team, layout), scale(team)  # type: ignore[arg-type]
     first = first_estimates(team, copies, cs.load("case-b").settings.start, size)
     nu = Schedule.of(automatic(size)).final
-    world = world_of(team, copies, nu, size, convex=True, weather=Weather(loss, seed=1), body=Body(10, SPEED))
+    world = world_of(team, copies, nu, size, convex=True, faults=Faults(loss, seed=1), body=Body(10, SPEED))
     now, _ = jax.jit(begin, static_argnames=("protocol",), compiler_options=quick_compilation())(
         Admm(), world, jnp.asarray(first), jax.random.key(0)
     )

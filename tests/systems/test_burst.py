@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.engine.round import Weather
+from consat.faults import Faults
 
 
 def test_a_team_gets_through_bursts_and_the_share_that_is_lost_is_that_of_the_chain() -> None:
@@ -26,4 +26,4 @@ def test_what_are_no_probabilities_is_refused(burst: tuple[float, ...]) -> None:
 
 
 def test_no_burst_is_the_same_as_before() -> None:
-    assert Weather() == Weather(0.0, 0.0, 0, None)
+    assert Faults() == Faults(0.0, 0.0, 0, None)

@@ -13,8 +13,9 @@ import pytest
 
 import consat as cs
 from consat.certify.optimum import max_min
-from consat.engine.round import Weather, world_of
+from consat.engine.round import world_of
 from consat.engine.rounds import simulate_rounds
+from consat.faults import Faults
 from consat.numerics import float64
 from consat.problem.objective import Nu
 from consat.problem.units import scale
@@ -92,7 +93,7 @@ def _against_recursion(protocol: Any, mix: Callable[[np.ndarray, np.ndarray], np
     copies, nu = Estimates.of(team, "local"), Nu(5.0, 5.0)
     first = np.random.default_rng(5).uniform(-4, 4, (copies.count, 2))
     trace = simulate_rounds(team, protocol, copies, nu, scale(team), first, convex=True, rounds=30, stop="never")
-    everyone = world_of(team, copies, nu, scale(team), convex=True, weather=Weather(), body=None).everyone
+    everyone = world_of(team, copies, nu, scale(team), convex=True, faults=Faults(), body=None).everyone
     adjacency = np.zeros((copies.count, copies.count))
     adjacency[tuple(copies.edges.T)] = 1.0
     W, weight = mix(adjacency, adjacency.sum(axis=1)), jnp.asarray(kappa(adjacency.sum(axis=1)))

@@ -75,6 +75,19 @@ class _Delay(click.ParamType[tuple[float, float]]):
         return ends[0], ends[-1]
 
 
+class _Burst(click.ParamType[tuple[float, float]]):
+    """Type of an option: two probabilities ``P,Q``."""
+
+    name = "P,Q"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        try:
+            p, q = value if isinstance(value, tuple) else map(float, str(value).split(","))
+        except ValueError:
+            self.fail(f"it is {value!r}, but must be two probabilities, such as 0.05,0.5", param, ctx)
+        return p, q
+
+
 class _Position(click.ParamType[tuple[float, ...]]):
     """Type of an option: numbers separated by commas."""
 
@@ -92,6 +105,9 @@ class _Position(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
+burst_option = click.option(
+    "--burst", type=_Burst(), metavar="P,Q", help="What arrives turns bad with probability P a message, good again with Q; bad is lost."
+)
 delay_option = click.option("--delay", type=_Delay(), default=(0.0, 0.0), help="How long to hold messages back where they arrive, s.")
 
 
@@ -160,8 +176,9 @@ def split(
 @click.option("--give-up", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="Who is silent so long has left for good.")
 @click.option("--report", type=click.FloatRange(min=0), default=0.1, show_default=True, metavar="SECONDS", help="Between two reports.")
 @loss_option
+@burst_option
 @delay_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of loss and delay.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the faults: loss, bursts, delay.")
 @keys_option
 @click.option("--attached", is_flag=True, help="Read orders from stdin, and stop when it ends.")
 @click.option("--standby", is_flag=True, help="Wait for the order to join, on stdin.")
@@ -169,31 +186,33 @@ def split(
 @port_option
 def agent(
     *, scenario: str, agent: str, overrides: tuple[str, ...], port: int, mode: Any, rate: float | None, pace: float,
-    rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, sends: Any, **around: Any,
+    rounds: int | None, memory: Path | None, give_up: float | None, report: float, keys: Path | None, sends: Any, **options: Any,
 ) -> int:  # fmt: skip
     """Run one agent, as on its own robot.
 
     FILE is its private file (consat split), or a scenario, of which it takes its own part. Events are JSON lines on stdout.
     """
     prepare_own(exact=mode == "lockstep")
-    from consat.network.deploy.process import Circumstances, run_agent
+    from consat.faults import Faults
+    from consat.network.deploy.process import ProcessOptions, run_agent
     from consat.network.node.modes import Manner, mode_for
     from consat.network.node.part import is_part, load_text, read_part
 
-    speed = around.pop("speed")
+    speed = options.pop("speed")
     part = _part(scenario, agent, overrides, port, mode)
     manner = Manner(
         mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report, sends
     )
-    if around["robot"] is not None and around["sensor"] != "stdin":
+    if options["robot"] is not None and options["sensor"] != "stdin":
         raise click.UsageError("--robot is commanded by what --sensor stdin measures; a simulated body is a point")
-    position = around["position"]
+    position = options["position"]
     if position is not None and len(position) != part.team.dimension:
         raise click.UsageError(f"--position has {counted(len(position), 'number')}, but must have {part.team.dimension}")
     file = Path(scenario)
     again = (lambda: read_part(load_text(file), scenario)) if file.is_file() and is_part(load_text(file), scenario) else None
-    around |= {"speed": math.inf if speed is None else speed, "keys": _keys(keys, scenario, [agent])}
-    run_agent(part, manner, Circumstances(**around), again)
+    faults = Faults(options.pop("loss"), seed=options.pop("seed"), burst=options.pop("burst"), delay=options.pop("delay"))
+    options |= {"faults": faults, "speed": math.inf if speed is None else speed, "keys": _keys(keys, scenario, [agent])}
+    run_agent(part, manner, ProcessOptions(**options), again)
     return DONE
 
 
@@ -209,6 +228,7 @@ def agent(
 @sends_option
 @speed_option
 @loss_option
+@burst_option
 @delay_option
 @rounds_option
 @until_option

@@ -16,8 +16,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from consat.engine.chunks import CHUNK, Chunk, Kept
 from consat.engine.partition import Halo, Share, assign
 from consat.engine.recording import Choice
-from consat.engine.round import Body, Now, Part, Spoken, Weather, World, begin, hear, precision_for, speak, world_of
+from consat.engine.round import Body, Now, Part, Spoken, World, begin, hear, precision_for, speak, world_of
 from consat.errors import InvalidSettings
+from consat.faults import Faults
 from consat.numerics import on_device, quick_compilation
 from consat.problem.graphs import hops
 from consat.problem.objective import Nu
@@ -73,7 +74,7 @@ class ManyProcesses:
         size: the team's natural scale.
         first: (C, d) initial estimates.
         convex: whether every ψ is known to be concave.
-        weather: message loss and sleep.
+        faults: message loss and sleep.
         body: how fast positions follow estimates.
         choice: what is recorded.
         hold: number of consecutive satisfied rounds that end the run; None if they do not.
@@ -83,7 +84,7 @@ class ManyProcesses:
     """
 
     def __init__(
-        self, team: Team, protocol: Rounds, copies: Estimates, nu: Nu, size: Scale, first: np.ndarray, *, convex: bool, weather: Weather,
+        self, team: Team, protocol: Rounds, copies: Estimates, nu: Nu, size: Scale, first: np.ndarray, *, convex: bool, faults: Faults,
         body: Body | None, choice: Choice, hold: int | None,
     ) -> None:  # fmt: skip
         self._count, self._me = jax.process_count(), jax.process_index()
@@ -91,9 +92,9 @@ class ManyProcesses:
             raise InvalidSettings(f"there are {self._count} processes for {team.count} agents; start no more processes than agents")
         part = assign(team, copies, self._count)
         self._share = share = Share.of(team, copies, part, self._me, self._count)
-        self._protocol, self._hold, self._choice, self._seed = protocol, hold, choice, weather.seed
+        self._protocol, self._hold, self._choice, self._seed = protocol, hold, choice, faults.seed
         self._first, self._agents, self._dimension = first[share.rows], team.count, team.dimension
-        world = world_of(share.team, share.copies, nu, size, convex=convex, weather=weather, body=body, partial=True)
+        world = world_of(share.team, share.copies, nu, size, convex=convex, faults=faults, body=body, partial=True)
         links = dataclasses.replace(world.everyone.links, metropolis=on_device(1.0 / (1.0 + share.degree)))
         everyone = dataclasses.replace(
             world.everyone, links=links, hops=hops(team.count, copies.links), precision=precision_for(team.count)

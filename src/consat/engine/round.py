@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from consat.engine.live import Live
+from consat.faults import Draw, Faults, draw
 from consat.numerics import Groups, on_device, pick
 from consat.problem.family import distinct
 from consat.problem.graphs import hops
@@ -108,24 +109,6 @@ class Everyone(LocalSolver):
 
 
 @dataclass(frozen=True)
-class Weather:
-    """What goes wrong on the way, seeded.
-
-    Attributes:
-        loss: probability that a message between two agents is lost, each direction by itself.
-        sleep: probability that an agent skips a round: it computes and sends nothing, but hears.
-        seed: of the draws.
-        burst: (p, q) for losses in bursts: a link, each direction by itself, turns bad in a round with probability p, and good again with
-            probability q; while it is bad nothing gets through (Gilbert 1960). None without.
-    """
-
-    loss: float = 0.0
-    sleep: float = 0.0
-    seed: int = 0
-    burst: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
 class Body:
     """A body cannot jump: p ← p + clip(x − p) to at most speed/rate a round.
 
@@ -208,8 +191,8 @@ class World:
         pair: (E,) the directed pair of agents that each end belongs to: a message carries all its copies.
         reach: most that a body moves in a round; None if it can jump.
         owners: see `consat.protocols.agreement`; None where bodies can jump and agents go by their estimates of one another.
-        loss: see `Weather`.
-        sleep: see `Weather`.
+        loss: see `consat.faults.Faults`.
+        sleep: see `consat.faults.Faults`.
         pairs: how many directed pairs.
         rough: whether messages can be lost or agents sleep.
         part: of which larger team this is a part; None of none.
@@ -217,7 +200,7 @@ class World:
         drive: the robots that bodies are; None of none.
         wind: (d,) velocity of the air, m/s; None where it is still.
         noise: the most that a measured position is wrong by, m; None where they are exact.
-        burst: (2,) see `Weather`; None without.
+        burst: (2,) see `consat.faults.Faults`; None without.
         events: whether agents send only what is news, see `consat.protocols.sending`.
     """
 
@@ -334,7 +317,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     ages, told = agreement.speak(now.ages, state.x, everyone)
     key, awake, through, bad = now.key, None, None, now.bad
     if world.rough:
-        key, awake, through, bad = _luck(world, now.key, now.bad)
+        key, awake, through, bad = _drawn(world, now.key, now.bad)
         state = _where_awake(protocol.per, world, awake, state, now.state)
         ages = _where_awake(_AGES, world, awake, ages, now.ages)
     targets = pick(state.x, world.own)
@@ -394,21 +377,12 @@ _AGES: Mapping[str, Any] = {"age": "agent", "heard": "link"}
 _BODIES: Mapping[str, Any] = {"position": "row", "stale": "row", "ages": _AGES}
 
 
-def _luck(world: World, key: Array, bad: Array | None) -> tuple[Array, Array, Array, Array | None]:
-    """The next key, (N,) who is awake, (pairs,) between whom messages get through, and between whom nothing does for now."""
-    key, draw_loss, draw_sleep = jax.random.split(key, 3)
+def _drawn(world: World, key: Array, bad: Array | None) -> Draw:
     part = world.part
-    if part is None:
-        awake, through = jax.random.uniform(draw_sleep, (world.everyone.agents,)), jax.random.uniform(draw_loss, (world.pairs,))
-    else:  # the same as in one process
-        awake = jax.random.uniform(draw_sleep, (part.agents,))[part.agent]
-        through = jax.random.uniform(draw_loss, (part.pairs,))[part.pair]
-    arrives = through >= world.loss
-    if bad is not None and world.burst is not None:
-        turns = jax.random.uniform(jax.random.fold_in(draw_loss, 1), bad.shape)
-        bad = jnp.where(bad, turns >= world.burst[1], turns < world.burst[0])
-        arrives &= ~bad
-    return key, awake >= world.sleep, arrives, bad
+    agents, pairs = (
+        ((world.everyone.agents, None), (world.pairs, None)) if part is None else ((part.agents, part.agent), (part.pairs, part.pair))
+    )
+    return draw(key, bad, loss=world.loss, sleep=world.sleep, burst=world.burst, agents=agents, pairs=pairs)
 
 
 def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Array, Array]]:
@@ -562,7 +536,7 @@ def world_of(
     size: Scale,
     *,
     convex: bool,
-    weather: Weather,
+    faults: Faults,
     body: Body | None,
     speaks: str = "link",
     partial: bool = False,
@@ -590,7 +564,7 @@ def world_of(
         convex=convex,
         precision=precision_for(team.count),
     )
-    rough = weather.loss > 0 or weather.sleep > 0 or weather.burst is not None
+    rough = faults.loss > 0 or faults.sleep > 0 or faults.burst is not None
     keys = talker.astype(np.int64) * team.count + listener
     pairs = distinct(keys)
     if not (rough or partial or events):  # then nobody asks who is at the ends
@@ -604,13 +578,13 @@ def world_of(
         pair=on_device(np.searchsorted(pairs, keys).astype(np.int32)),
         reach=None if reach is None else on_device(reach),
         owners=None if reach is None and speaks == "link" else _owners(copies, receiver, sender, block),
-        loss=on_device(weather.loss),
-        sleep=on_device(weather.sleep),
+        loss=on_device(faults.loss),
+        sleep=on_device(faults.sleep),
         pairs=len(pairs),
         rough=rough,
         live=live,
         wind=jnp.asarray(body.wind, dtype=float) if body is not None and any(body.wind) else None,
-        burst=None if weather.burst is None else jnp.asarray(weather.burst, dtype=float),
+        burst=None if faults.burst is None else jnp.asarray(faults.burst, dtype=float),
         noise=on_device(body.noise) if body is not None and body.noise > 0 else None,
         drive=None if body is None else body.drive,
         events=events,

@@ -18,8 +18,9 @@ from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
 from consat.engine.live import Live
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
-from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Now, Weather, World, world_of
+from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Now, World, world_of
 from consat.engine.violations import shares
+from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.objective import Nu
 from consat.problem.team import Team
@@ -164,7 +165,7 @@ def simulate_rounds(
     rounds: int | None = None,
     least: int = 0,
     stop: Stop = "satisfied",
-    weather: Weather | None = None,
+    faults: Faults | None = None,
     body: Body | None = None,
     record: bool | None = None,
     choice: Choice | None = None,
@@ -189,7 +190,7 @@ def simulate_rounds(
         rounds: how many; `PATIENCE` if None.
         least: rounds before which nothing ends the run, since constraints still move.
         stop: when to end earlier: every margin positive for `HOLD` rounds (or `hopeless` and settled); settled, or `enough`; or never.
-        weather: loss and sleep; none if None.
+        faults: loss and sleep; none if None.
         body: how fast positions follow estimates; at once if None.
         record: whether to keep all estimates; if None, while they are few.
         choice: what to record; if None, what the size of the team suggests.
@@ -201,7 +202,7 @@ def simulate_rounds(
         events: whether agents send only what is news, see `consat.protocols.sending`.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
-    weather = weather or Weather()
+    faults = faults or Faults()
     choice = choice or Choice.of(team, copies, estimates=record)
     most, turn = HOLD, None
     engine: Engine
@@ -209,25 +210,25 @@ def simulate_rounds(
         from consat.engine.cluster import ManyProcesses
 
         hold = HOLD if stop == "satisfied" else None
-        engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, weather=weather, body=body, choice=choice, hold=hold)
+        engine = ManyProcesses(team, protocol, copies, nu, size, first, convex=convex, faults=faults, body=body, choice=choice, hold=hold)
     else:
         live = Live.of(team, 0.0 if body is None else 1.0 / body.rate, all_of_them=False)
-        how: Any = {"convex": convex, "weather": weather, "body": body, "speaks": protocol.speaks, "events": events}
+        how: Any = {"convex": convex, "faults": faults, "body": body, "speaks": protocol.speaks, "events": events}
         world = world_of(team, copies, nu, size, live=live, **how)
         most = longest_hold(protocol, world)
         ends = (HOLD, most) if stop == "satisfied" else None
-        engine = OneProcess(protocol, world, first, weather.seed, choice, ends, knowing=ENOUGH[stop])
+        engine = OneProcess(protocol, world, first, faults.seed, choice, ends, knowing=ENOUGH[stop])
         if then is not None:
             other = functools.partial(world_of, team, then, nu, size, **how)
             turn = Turn(lambda first: OneProcess(
-                protocol, other(), first, later(weather.seed), _over(choice, copies, then), ends, knowing=ENOUGH[stop]
+                protocol, other(), first, later(faults.seed), _over(choice, copies, then), ends, knowing=ENOUGH[stop]
             ), copies, then)  # fmt: skip
     rules = Rules(
         end=least + PATIENCE if rounds is None else rounds, least=least, stop=stop, most=most, still=stillness(size.length, enough),
         earliest=protocol.earliest(engine.world.everyone),
         hopeless=hopeless, enough=enough, turn=None if turn is None else turn_after(engine.world),
     )  # fmt: skip
-    how_run = (protocol, nu, size, first, weather, body, copies.layout, convex, *["events"] * events)
+    how_run = (protocol, nu, size, first, faults, body, copies.layout, convex, *["events"] * events)
     problem = "" if checkpoint is None else fingerprint(team, *how_run)
     course = _Course(team, engine, rules, choice, body, turn)
     if turn is not None and checkpoint is not None and checkpoint.turned:

@@ -12,8 +12,9 @@ import numpy as np
 
 from consat.engine import Stop
 from consat.engine.recording import Who
-from consat.engine.round import Body, Weather
+from consat.engine.round import Body
 from consat.errors import InvalidSettings
+from consat.faults import Faults
 from consat.problem.team import Team
 from consat.protocols.estimates import Layout
 from consat.protocols.sending import SENDS, Sends
@@ -119,14 +120,9 @@ class Options:
         if team.moves:
             raise InvalidSettings(f"constraints move with time, and protocol {kind} flows without rounds; use a protocol in rounds")
 
-    def weather(self, seed: int) -> Weather:
-        """Message loss and sleep. Raises: InvalidSettings: a probability is out of range."""
-        if not (0 <= self.loss < 1 and 0 <= self.sleep < 1):
-            raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
-        if self.burst is not None and not (len(self.burst) == 2 and all(0 < each <= 1 for each in self.burst)):
-            message = f"burst is {list(self.burst)}, but must be two probabilities, of a link's turning bad and of its turning good again"
-            raise InvalidSettings(message)
-        return Weather(self.loss, self.sleep, seed, self.burst)
+    def faults(self, seed: int) -> Faults:
+        """Faults of messages and agents. Raises: InvalidSettings: a probability is out of range."""
+        return Faults(self.loss, self.sleep, seed, self.burst)
 
     def _driven(self, team: Team, rate: float) -> dict[str, Any]:
         """Keyword arguments of `Body` for robots; empty without robots. `rate`: rounds per second, Hz."""

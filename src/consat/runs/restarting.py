@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from consat.engine.batch import Case, Lane, Then, simulate_batch
-from consat.engine.round import Weather, World, world_of
+from consat.engine.round import World, world_of
 from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness, turn_after
+from consat.faults import Faults
 from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import ROUNDS, with_gains
@@ -21,12 +22,12 @@ from consat.runs.summary import number
 from consat.settings import Settings, Start
 
 
-def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
+def case_of(ready: Prepared, faults: Faults, options: Options) -> Case:
     """Settings that runs of one team share, for `consat.engine.batch`.
 
     Args:
         ready: the team and its settings.
-        weather: message loss and sleep; every run has its own seed.
+        faults: message loss and sleep; every run has its own seed.
         options: options that determine the stop rules.
     """
     asked, nu = ready.settings.protocol, ready.schedule.final
@@ -34,7 +35,7 @@ def case_of(ready: Prepared, weather: Weather, options: Options) -> Case:
     gains = {key: getattr(with_gains(protocol, asked), key) for key in ("penalty", "relaxation", "step") if getattr(asked, key) is not None}
 
     def world(copies: Estimates) -> World:
-        return world_of(ready.team, copies, nu, ready.size, convex=ready.convex, weather=weather, body=None, speaks=protocol.speaks)
+        return world_of(ready.team, copies, nu, ready.size, convex=ready.convex, faults=faults, body=None, speaks=protocol.speaks)
 
     along = world(ready.copies)
     rules = Rules(
@@ -63,8 +64,8 @@ def best_start(team: Team, settings: Settings, options: Options) -> dict[str, An
         every constraint, and the last margin of each run, null where it is not finite.
     """
     ready, start = Prepared.of(team, settings), settings.start
-    count, weather = options.restarts, Weather(options.loss, options.sleep)
-    case = case_of(ready, weather, options)
+    count, faults = options.restarts, Faults(options.loss, options.sleep)
+    case = case_of(ready, faults, options)
     seeds = range(start.seed, start.seed + count)
     lanes = [Lane(case, ready.first(Start(box=start.box, seed=seed)), seed) for seed in seeds]
     outcomes = simulate_batch(ROUNDS[str(settings.protocol.kind)](), lanes)

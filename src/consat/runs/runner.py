@@ -181,13 +181,13 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
     if kind in FLOWS:
         options.require_flow(kind, team)
         return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=options.until, **how))
-    pace, weather = options.pace(kind, team), options.weather(settings.start.seed)
+    pace, faults = options.pace(kind, team), options.faults(settings.start.seed)
     how |= {"events": options.events}
     if options.restarts > 1:
         found = best_start(team, settings, options)
         settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
-        weather, more = options.weather(found["seed"]), more | {"restarts": found}
-    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, weather=weather, **pace._asdict(), **how))
+        faults, more = options.faults(found["seed"]), more | {"restarts": found}
+    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, faults=faults, **pace._asdict(), **how))
 
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:

@@ -132,7 +132,7 @@ class Session:
             )
         self._protocol = with_gains(ROUNDS[kind](), settings.protocol)
         self._body = self._body_of(scenario.team)
-        self._weather = self._options.weather(settings.start.seed)
+        self._faults = self._options.faults(settings.start.seed)
         ready = Prepared.of(scenario.team, settings)
         self._engine = self._built(ready, ready.first(drive=self._body.drive), self._body)
         self._extent = ready.size.extent / ready.size.length
@@ -418,7 +418,7 @@ class Session:
             InvalidSettings: `share` is out of range.
         """
         options = dataclasses.replace(self._options, loss=share)
-        self._weather = options.weather(self._weather.seed)
+        self._faults = options.faults(self._faults.seed)
         self._options = options
         self._restructure(self.team)
         return self
@@ -495,11 +495,11 @@ class Session:
         live = Live.of(team, 1.0 / body.rate, all_of_them=True)
         assert live is not None
         world = world_of(
-            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, weather=self._weather, body=body,
+            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, faults=self._faults, body=body,
             speaks=self._protocol.speaks, live=live, events=self._options.events,
         )  # fmt: skip
         choice = Choice.of(team, ready.copies, "all", estimates=False)
-        carrier = OneProcess(self._protocol, world, first, self._weather.seed, choice, None)
+        carrier = OneProcess(self._protocol, world, first, self._faults.seed, choice, None)
         return _Engine(ready, carrier, live)
 
     def _restructure(self, team: Team) -> None:

@@ -19,8 +19,8 @@ from consat import __version__
 from consat.certify.certificate import bounds
 from consat.engine import Stop
 from consat.engine.batch import Lane, Outcome, like, simulate_batch
-from consat.engine.round import Weather
 from consat.errors import InvalidSettings, shown
+from consat.faults import Faults
 from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS
@@ -119,7 +119,7 @@ class _Combination(NamedTuple):
 
     chosen: Mapping[str, Any]
     ready: Prepared
-    weather: tuple[float, float]
+    faults: tuple[float, float]
 
 
 @float64
@@ -243,7 +243,7 @@ class _Asked:
         protocols = {}
         for k, combination in enumerate(combinations):
             kind = str(combination.ready.settings.protocol.kind)
-            case = case_of(combination.ready, Weather(*combination.weather), self.options)
+            case = case_of(combination.ready, Faults(*combination.faults), self.options)
             key = (kind, like(case))
             protocols[key] = ROUNDS[kind]()
             box = combination.ready.settings.start.box
@@ -272,7 +272,7 @@ class _Asked:
         """Run all combinations one after the other."""
         satisfied, total = 0, len(combinations) * len(seeds)
         for k, (combination, seed) in enumerate(itertools.product(combinations, seeds)):
-            ready, (loss, sleep) = combination.ready, combination.weather
+            ready, (loss, sleep) = combination.ready, combination.faults
             scenario = Scenario(self.scenario.name, ready.team, ready.settings, "", self.scenario.source)
             result = run(
                 scenario,

@@ -13,6 +13,7 @@ import numpy as np
 
 from consat.engine.rounds import HOLD, SETTLED
 from consat.errors import NetworkError
+from consat.faults import Faults
 from consat.network.deploy.commands import Script, Stage, Timed, load_commands, no_commands
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
@@ -59,6 +60,7 @@ class Plan:
         pace: in mode link, protocol time per real time, s/s.
         speed: largest speed of a body, length/s; None for no limit.
         loss: probability that an incoming message is dropped.
+        burst: (p, q) of losses in bursts, see `consat.faults.Faults`; None for no bursts.
         delay: (low, high) range of the random delay of incoming messages, s.
         rounds: number of turns; None for no limit.
         until: duration, s, counted from the time when all agents have begun; None for no limit.
@@ -73,6 +75,7 @@ class Plan:
     pace: float = 1.0
     speed: float | None = None
     loss: float = 0.0
+    burst: tuple[float, float] | None = None
     delay: tuple[float, float] = (0.0, 0.0)
     rounds: int | None = None
     until: float | None = None
@@ -82,7 +85,8 @@ class Plan:
     sends: Sends = "all"
 
     def __post_init__(self) -> None:
-        Manner(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if the mode options are not valid
+        Manner(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if options are not valid
+        Faults(self.loss, burst=self.burst, delay=self.delay)
 
     @property
     def ending(self) -> Stop:
@@ -100,6 +104,7 @@ class Plan:
         given = {
             "--mode": self.mode, "--rate": self.rate, "--speed": self.speed, "--rounds": self.rounds,
             "--pace": self.pace if self.pace != 1.0 else None, "--loss": self.loss or None,
+            "--burst": None if self.burst is None else f"{self.burst[0]},{self.burst[1]}",
             "--delay": f"{self.delay[0]},{self.delay[1]}" if self.delay[1] else None, "--keys": self.keys,
             "--sends": None if self.sends == "all" else self.sends,
         }  # fmt: skip

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from consat.errors import InvalidInput, InvalidSettings, InvalidTeam
+from consat.faults import Faults
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
 from consat.network.node.core import Embodied, Moment
 from consat.network.node.helm import Helm
@@ -36,7 +37,7 @@ from consat.network.node.part import Part
 from consat.network.node.pilot import RobotBody
 from consat.network.node.station import Station
 from consat.network.transports import Transport
-from consat.network.transports.faults import Weathered
+from consat.network.transports.faults import FaultyTransport
 from consat.robots.description import asked
 
 NAP: Final = 0.05
@@ -47,13 +48,11 @@ LINGER: Final = 2.0
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class ProcessOptions:
     """Options of an agent's process.
 
     Attributes:
-        loss: probability that an incoming message is dropped, for experiments.
-        delay: (low, high) range of the random delay of incoming messages, s, for experiments.
-        seed: seed of loss and delay.
+        faults: faults of incoming messages, for experiments.
         speed: largest speed of the body, length/s.
         robot: kind of the robot that is commanded; None for that of the scenario, if any.
         sensor: ``simulated``, or ``stdin`` if measured positions are read from stdin.
@@ -67,9 +66,7 @@ class Circumstances:
         standby: whether to wait for the order ``join``.
     """
 
-    loss: float = 0.0
-    delay: tuple[float, float] = (0.0, 0.0)
-    seed: int = 0
+    faults: Faults = field(default_factory=Faults)
     speed: float = math.inf
     robot: str | None = None
     sensor: Literal["simulated", "stdin"] = "simulated"
@@ -97,41 +94,41 @@ class Anew(NamedTuple):
     membership: Membership
 
 
-def run_agent(part: Part, manner: Manner, around: Circumstances, again: Callable[[], Part] | None = None) -> None:
+def run_agent(part: Part, manner: Manner, options: ProcessOptions, again: Callable[[], Part] | None = None) -> None:
     """Run one agent until it is done or told to stop.
 
     Args:
         part: local problem of the agent.
         manner: its mode and rate.
-        around: options of the process.
+        options: options of the process.
         again: reads the part from its file again; None if the part has no file.
 
     Raises:
         NetworkError: its address is in use, or its keys are not usable.
         InvalidSettings: mode and protocol do not fit, or constraints move and the time t = 0 is not known.
     """
-    part = part if around.epoch is None else replace(part, epoch=around.epoch)
+    part = part if options.epoch is None else replace(part, epoch=options.epoch)
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     dimension = part.team.dimension
-    measured = _measured(part, around) if around.sensor == "stdin" else None
-    body = SimulatedBody(_start(part, around), around.speed) if measured is None else measured
-    reading = around.attached or measured is not None or around.standby
+    measured = _measured(part, options) if options.sensor == "stdin" else None
+    body = SimulatedBody(_start(part, options), options.speed) if measured is None else measured
+    reading = options.attached or measured is not None or options.standby
     if part.team.moves and part.epoch is None and manner.mode != "lockstep" and not reading:
         raise InvalidSettings("constraints move with time, but nobody says when t = 0 is; say --epoch, to all agents the same")
     orders = Orders(None if measured is None else dimension, reading=reading)
     with heeding_signals(orders):
-        helm = Helm(part.me, dimension, measured, around.sensor_timeout, _write)
+        helm = Helm(part.me, dimension, measured, options.sensor_timeout, _write)
         core = core_of(part, manner)
         _warm(core)
         begin = Anew(part, core, Membership(part))
-        told = _wait_to_join(begin, orders, again) if around.standby else begin
-        end = math.inf if around.until is None else time.monotonic() + around.until
+        told = _wait_to_join(begin, orders, again) if options.standby else begin
+        end = math.inf if options.until is None else time.monotonic() + options.until
         try:
             with ThreadPoolExecutor(1) as reader:
                 own = _Own(body, orders, helm, again, reader, deque(), end)
                 while isinstance(told, Anew):
-                    told = _live(told, manner, around, own)
+                    told = _live(told, manner, options, own)
         except BaseException:
             helm.stand()
             raise
@@ -159,10 +156,10 @@ class _Own(NamedTuple):
     end: float
 
 
-def _live(begin: Anew, manner: Manner, around: Circumstances, own: _Own) -> Anew | str:
+def _live(begin: Anew, manner: Manner, options: ProcessOptions, own: _Own) -> Anew | str:
     """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
     part = begin.part
-    with _transport(part, manner, around) as transport:
+    with _transport(part, manner, options) as transport:
         runner = runner_of(
             part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=_write,
             core=begin.core,
@@ -171,7 +168,7 @@ def _live(begin: Anew, manner: Manner, around: Circumstances, own: _Own) -> Anew
         station.membership.adopt(begin.membership)
         station.log("start", mode=manner.mode, run=part.run, pid=os.getpid(), rounds=manner.mode == "lockstep")
         try:
-            told = _loop(runner, transport, own, around)
+            told = _loop(runner, transport, own, options)
         except BaseException:
             own.helm.stand()  # before the transport is closed, which may take long
             raise
@@ -184,7 +181,7 @@ def _live(begin: Anew, manner: Manner, around: Circumstances, own: _Own) -> Anew
         return told
 
 
-def _loop(runner: Runner, transport: Transport, own: _Own, around: Circumstances) -> Anew | str:
+def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptions) -> Anew | str:
     station, orders, helm = runner.station, own.orders, own.helm
     known_since = math.inf
     while True:
@@ -202,7 +199,7 @@ def _loop(runner: Runner, transport: Transport, own: _Own, around: Circumstances
             return orders.stopped
         if now >= own.end:
             return "out of time"
-        if around.stop == "satisfied" and now - known_since >= LINGER:
+        if options.stop == "satisfied" and now - known_since >= LINGER:
             return str(station.known)
         transport.wait(min(max(due - now, 0.0), NAP))
 
@@ -318,32 +315,32 @@ def _warm(core: Embodied) -> None:
     core.margin(look.bodies)
 
 
-def _measured(part: Part, around: Circumstances) -> MeasuredBody:
+def _measured(part: Part, options: ProcessOptions) -> MeasuredBody:
     """A body with an external sensor: a robot if the scenario or the command line names one, else a point."""
-    robots = asked(around.robot, None, part.robots, part.team.ids)
+    robots = asked(options.robot, None, part.robots, part.team.ids)
     if robots is None:
-        return MeasuredBody(around.speed, around.sensor_timeout)
-    if math.isfinite(around.speed):
+        return MeasuredBody(options.speed, options.sensor_timeout)
+    if math.isfinite(options.speed):
         raise InvalidSettings("--speed is of bodies that are points; robots have a speed of their own, robots: {speed: ..}")
-    return RobotBody(robots, part.team.dimension, around.sensor_timeout)
+    return RobotBody(robots, part.team.dimension, options.sensor_timeout)
 
 
-def _start(part: Part, around: Circumstances) -> np.ndarray:
-    return part.first[part.team.ids.index(part.me)] if around.position is None else np.array(around.position, dtype=float)
+def _start(part: Part, options: ProcessOptions) -> np.ndarray:
+    return part.first[part.team.ids.index(part.me)] if options.position is None else np.array(options.position, dtype=float)
 
 
 @contextmanager
-def _transport(part: Part, manner: Manner, around: Circumstances) -> Iterator[Transport]:
+def _transport(part: Part, manner: Manner, options: ProcessOptions) -> Iterator[Transport]:
     from consat.network import keys
     from consat.network.transports.zenoh import connect
 
-    credentials = None if around.keys is None else keys.load(around.keys, part.me)
+    credentials = None if options.keys is None else keys.load(options.keys, part.me)
     listen, *others = (_protected(address) if credentials else address for address in (part.listen, *(n.address for n in part.neighbours)))
     addresses = {neighbour.id: address for neighbour, address in zip(part.neighbours, others, strict=True)}
     transport = connect(part.run, part.me, listen, addresses, reliable=manner.reliable, credentials=credentials)
     try:
-        if around.loss > 0 or around.delay[1] > 0:
-            yield Weathered(transport, time.monotonic, loss=around.loss, delay=around.delay, seed=around.seed)
+        if options.faults.on_messages:
+            yield FaultyTransport(transport, time.monotonic, options.faults)
         else:
             yield transport
     finally:

@@ -15,7 +15,7 @@ import numpy as np
 from consat.network.node.body import SimulatedBody
 from consat.network.node.modes import Manner, Runner, runner_of
 from consat.network.node.part import Part
-from consat.network.transports.memory import Air
+from consat.network.transports.memory import MemoryNetwork
 
 OPENING = 0.01
 """Time between the start of an agent and its first step, s, in which messages can arrive."""
@@ -29,7 +29,7 @@ class Rehearsal:
     Args:
         parts: the part (local problem) of each agent, by id.
         manner: mode and rate of the agents.
-        air: the simulated network.
+        network: the simulated network.
         speed: largest speed of a body, length/s.
         build: makes the runner of an agent; by default as a process does.
         skew: by how much the Unix time of an agent is ahead of the time of the network, s, by id; 0 for agents that are not listed.
@@ -39,13 +39,13 @@ class Rehearsal:
         self,
         parts: Mapping[str, Part],
         manner: Manner,
-        air: Air,
+        network: MemoryNetwork,
         *,
         speed: float = np.inf,
         build: Callable[..., Runner] = runner_of,
         skew: Mapping[str, float] | None = None,
     ) -> None:
-        self.parts, self.manner, self.air = parts, manner, air
+        self.parts, self.manner, self.network = parts, manner, network
         self.events: list[dict[str, Any]] = []
         self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
@@ -66,19 +66,19 @@ class Rehearsal:
             manner = Manner(**({field: getattr(self.manner, field) for field in self.manner.__dataclass_fields__} | changes))
             with jax.enable_x64(True):
                 self.runners[agent] = self._build(
-                    part, manner, self.air.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
-                    clock=self.air.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
+                    part, manner, self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
+                    clock=self.network.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
                     wall=functools.partial(self._wall, self._skew.get(agent, 0.0)),
                 )  # fmt: skip
-            self._due[agent] = self.air.now + OPENING
+            self._due[agent] = self.network.now + OPENING
 
     def _wall(self, skew: float) -> float:
-        return self.air.now + skew
+        return self.network.now + skew
 
     def kill(self, *agents: str) -> None:
         """End agents without notice, as a crash does."""
         for agent in agents:
-            self.air.close(agent)
+            self.network.close(agent)
             del self.runners[agent], self._due[agent]
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -91,17 +91,17 @@ class Rehearsal:
         Returns:
             whether the condition became true.
         """
-        end = self.air.now + seconds
+        end = self.network.now + seconds
         with jax.enable_x64(True):
-            while (now := min(self.air.next(), *self._due.values(), np.inf)) <= end:
-                self.air.now = max(now, self.air.now)
-                ready = self.air.deliver() & self.runners.keys()
-                ready |= {agent for agent, due in self._due.items() if due <= self.air.now}
+            while (now := min(self.network.next(), *self._due.values(), np.inf)) <= end:
+                self.network.now = max(now, self.network.now)
+                ready = self.network.deliver() & self.runners.keys()
+                ready |= {agent for agent, due in self._due.items() if due <= self.network.now}
                 for agent in sorted(ready):
                     self._step(agent)
                 if until():
                     return True
-        self.air.now = end
+        self.network.now = end
         return until()
 
     def _step(self, agent: str) -> None:
@@ -110,7 +110,7 @@ class Rehearsal:
         if runner.done:
             self.kill(agent)
             return
-        self._due[agent] = max(due, self.air.now + SHORTEST)
+        self._due[agent] = max(due, self.network.now + SHORTEST)
 
     def positions(self) -> dict[str, np.ndarray]:
         """The current position of each body, (d,), by id."""

@@ -1,4 +1,4 @@
-"""Wraps a transport with seeded loss and delay of incoming messages, for experiments on a network that works."""
+"""Wraps a transport with seeded faults of incoming messages, for experiments on a network that works."""
 
 from __future__ import annotations
 
@@ -8,25 +8,22 @@ from collections.abc import Callable
 
 import numpy as np
 
+from consat.faults import Channel, Faults
 from consat.network.transports import Transport
 
 
-class Weathered:
-    """A transport that loses and delays the messages that arrive over another one.
+class FaultyTransport:
+    """A transport on which incoming messages suffer faults.
 
     Args:
         inner: the wrapped transport.
         clock: clock of this agent, s.
-        loss: probability that an incoming message is dropped.
-        delay: (low, high) range of the random delay of each message, s. Different delays also reorder messages.
-        seed: seed of the random draws.
+        faults: what goes wrong with messages.
     """
 
-    def __init__(
-        self, inner: Transport, clock: Callable[[], float], *, loss: float = 0.0, delay: tuple[float, float] = (0.0, 0.0), seed: int = 0
-    ) -> None:
-        self._inner, self._clock, self._loss, self._delay = inner, clock, loss, delay
-        self._random = np.random.default_rng(seed)
+    def __init__(self, inner: Transport, clock: Callable[[], float], faults: Faults) -> None:
+        self._inner, self._clock = inner, clock
+        self._channel = Channel(faults, np.random.default_rng(faults.seed))
         self._held: list[tuple[float, int, bytes]] = []
         self._order = itertools.count()
 
@@ -36,8 +33,8 @@ class Weathered:
     def _take(self) -> None:
         now = self._clock()
         for payload in self._inner.receive():
-            if self._random.random() >= self._loss:
-                heapq.heappush(self._held, (now + self._random.uniform(*self._delay), next(self._order), payload))
+            for delay in self._channel.delays():
+                heapq.heappush(self._held, (now + delay, next(self._order), payload))
 
     def receive(self) -> list[bytes]:
         self._take()

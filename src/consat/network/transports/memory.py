@@ -6,46 +6,33 @@ import heapq
 import itertools
 from collections import deque
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
+from consat.faults import Channel, Faults
 from consat.network.transports import Transport
 
 QUEUE = 4096
 """Largest number of messages that wait for an agent; the oldest are dropped."""
+LATENCY = 1e-4
+"""Time that every message takes, s."""
 
 
-@dataclass(frozen=True)
-class Conditions:
-    """Faults of the simulated network.
-
-    Attributes:
-        loss: probability that a message is lost.
-        delay: (low, high) range of the random delay of each message, s. Different delays also reorder messages.
-        repeat: probability that a message is duplicated.
-    """
-
-    loss: float = 0.0
-    delay: tuple[float, float] = (1e-4, 1e-4)
-    repeat: float = 0.0
-
-
-class Air:
+class MemoryNetwork:
     """The simulated network that carries the messages of all agents.
 
     Args:
-        conditions: faults of the network; by default only a constant delay.
-        seed: seed of the random draws.
+        faults: faults of its messages, in addition to `LATENCY`.
 
     Attributes:
         now: simulated time, s; the owner of the network advances it.
     """
 
-    def __init__(self, conditions: Conditions | None = None, seed: int = 0) -> None:
-        self.conditions = conditions or Conditions()
+    def __init__(self, faults: Faults | None = None) -> None:
+        self._faults = faults or Faults()
         self.now = 0.0
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng(self._faults.seed)
+        self._channels: dict[tuple[str, str], Channel] = {}
         self._flying: list[tuple[float, int, str, bytes]] = []
         self._order = itertools.count()
         self._open: dict[str, _Endpoint] = {}
@@ -93,10 +80,10 @@ class Air:
 
     def post(self, source: str, to: str, payload: bytes) -> None:
         """Send a message from `source` to `to`, subject to loss, delay, duplication and partitions."""
-        conditions = self.conditions
-        for _ in range(1 + (self._random.random() < conditions.repeat)):
-            if self._random.random() >= conditions.loss and not self.apart(source, to):
-                heapq.heappush(self._flying, (self.now + self._random.uniform(*conditions.delay), next(self._order), to, payload))
+        channel = self._channels.setdefault((source, to), Channel(self._faults, self._random))
+        for delay in channel.delays():
+            if not self.apart(source, to):
+                heapq.heappush(self._flying, (self.now + LATENCY + delay, next(self._order), to, payload))
 
     def close(self, agent: str, endpoint: _Endpoint | None = None) -> None:
         """Close the endpoint of an agent, as a crash does. If `endpoint` is given, only if it is still the agent's current one."""
@@ -107,13 +94,13 @@ class Air:
 class _Endpoint:
     """The `Transport` of one agent on the simulated network."""
 
-    def __init__(self, air: Air, me: str, neighbours: frozenset[str]) -> None:
-        self._air, self._me, self._neighbours = air, me, neighbours
+    def __init__(self, network: MemoryNetwork, me: str, neighbours: frozenset[str]) -> None:
+        self._network, self._me, self._neighbours = network, me, neighbours
         self.queue: deque[bytes] = deque(maxlen=QUEUE)
 
     def send(self, neighbour: str, payload: bytes) -> None:
         if neighbour in self._neighbours:
-            self._air.post(self._me, neighbour, payload)
+            self._network.post(self._me, neighbour, payload)
 
     def receive(self) -> list[bytes]:
         found = list(self.queue)
@@ -125,7 +112,7 @@ class _Endpoint:
         return bool(self.queue)
 
     def alive(self) -> frozenset[str]:
-        return frozenset(agent for agent in self._neighbours if self._air.up(agent) and not self._air.apart(self._me, agent))
+        return frozenset(agent for agent in self._neighbours if self._network.up(agent) and not self._network.apart(self._me, agent))
 
     def close(self) -> None:
-        self._air.close(self._me, self)
+        self._network.close(self._me, self)
