@@ -45,6 +45,8 @@ class Faults:
     def __post_init__(self) -> None:
         if not (0 <= self.loss < 1 and 0 <= self.sleep < 1):
             raise InvalidSettings(f"loss is {self.loss} and sleep is {self.sleep}, but both must be probabilities below 1")
+        if not 0 <= self.repeat <= 1:
+            raise InvalidSettings(f"repeat is {self.repeat}, but must be a probability")
         if self.burst is not None and not (len(self.burst) == 2 and all(0 < each <= 1 for each in self.burst)):
             message = f"burst is {list(self.burst)}, but must be two probabilities, of a link's turning bad and of its turning good again"
             raise InvalidSettings(message)
@@ -54,7 +56,7 @@ class Faults:
     @property
     def on_messages(self) -> bool:
         """Whether anything happens to messages."""
-        return self.loss > 0 or self.burst is not None or self.delay[1] > 0 or self.repeat > 0
+        return self != Faults(sleep=self.sleep, seed=self.seed)
 
 
 class Channel:

@@ -1,5 +1,6 @@
 """Each worked diff of CONTRIBUTING.md, applied to a copy of the source, does what it says."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -23,6 +24,11 @@ from consat.certify.quadratics import shape_of
 assert shape_of(cs.loads(scenario).team).concave.all()
 try: cs.loads(scenario.replace("[2, 0.5]", "[2]"))
 except cs.InvalidScenario as error: assert "axes has 1 entry" in str(error)
+session = cs.Session(cs.loads(scenario)).step(20)
+try: session.change("a", "zone", axes=[0, 0])
+except cs.InvalidTeam as error: assert "axes" in str(error)
+else: raise AssertionError("a session takes axes that a scenario must not have")
+assert session.change("a", "zone", center=[2, 0]).step(20).satisfied
 """,
     "A protocol": """
 r = cs.run("case-b", protocol="bounded-flow", until=200, start=(-1, 1))
@@ -81,6 +87,7 @@ def changes(section: str) -> Iterator[tuple[str, list[tuple[list[str], list[str]
 
 def test_worked_diffs_work(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "src" / "consat", tmp_path / "src" / "consat", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for title in USES:
         for name, change in changes(SECTIONS[title]):
             path = tmp_path / name
@@ -98,6 +105,10 @@ def test_worked_diffs_work(tmp_path: Path) -> None:
     code = "\n".join(
         [f"import sys; sys.path.insert(0, {source!r})", "import consat as cs", f"assert {source!r} in cs.__file__", *USES.values()]
     )
+    tools, environment = Path(sys.executable).parent, os.environ | {"PYTHONPATH": source}
+    for check in (["ruff", "check", "src"], ["ruff", "format", "--check", "src"], ["lint-imports", "--no-cache"]):
+        said = subprocess.run([tools / check[0], *check[1:]], capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
+        assert said.returncode == 0, said.stdout[-2000:] + said.stderr[-2000:]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path, timeout=280)
     assert done.returncode == 0, done.stderr[-2000:]
 

@@ -64,7 +64,7 @@ def best_start(team: Team, settings: Settings, options: Options) -> dict[str, An
         every constraint, and the last margin of each run, null where it is not finite.
     """
     ready, start = Prepared.of(team, settings), settings.start
-    count, faults = options.restarts, Faults(options.loss, options.sleep)
+    count, faults = options.restarts, Faults(options.loss, options.sleep, burst=options.burst)
     case = case_of(ready, faults, options)
     seeds = range(start.seed, start.seed + count)
     lanes = [Lane(case, ready.first(Start(box=start.box, seed=seed)), seed) for seed in seeds]

@@ -6,7 +6,7 @@ To add a kind, write these two functions and add the factory to `KINDS`. Scenari
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 import jax.numpy as jnp
@@ -241,18 +241,29 @@ def farthest(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray], cent
     return float(away.max(initial=0.0))
 
 
-def adjustable(psi: Callable[..., Any], parameters: Iterable[str]) -> Mapping[str, Parameter]:
+def adjustable(kind: str, psi: Callable[..., Any], values: Mapping[str, Any]) -> Mapping[str, Parameter]:
     """The parameters of a constraint that can be changed while a team runs, and what their values must satisfy.
 
-    None for a text expression, because its numbers have no names.
+    None for a text expression, because its numbers have no names. Other kinds are asked through their factory in `KINDS`.
 
     Args:
-        psi: the function of the constraint.
-        parameters: names of its parameters.
+        kind: kind of the constraint.
+        psi: its function.
+        values: its parameters.
     """
     if isinstance(psi, Formula):
         return {}
-    return ADJUSTABLE[psi] if psi in ADJUSTABLE else {key: Fixed(None) for key in parameters if key != "t"}
+    if psi in ADJUSTABLE:
+        return ADJUSTABLE[psi]
+    free = {key: value for key, value in values.items() if key != "t"}
+    if kind in KINDS:
+        arguments = inspect.signature(KINDS[kind]).parameters
+        if free.keys() <= arguments.keys():
+            reads = {key: kind for key, each in arguments.items() if each.default is each.empty and key not in free}
+            made = KINDS[kind](**free, **reads)
+            if isinstance(made, Constraint) and made.psi is psi:
+                return {key: made.parameters[key] for key in free}
+    return {key: Fixed(None) for key in free}
 
 
 KINDS: Final[Mapping[str, Callable[..., Constraint | list[Constraint]]]] = {
