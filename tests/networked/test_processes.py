@@ -1,11 +1,13 @@
 """Agents as processes over zenoh on loopback. Few, for each takes seconds to start; `test_rehearsal.py` has the many."""
 
+import fcntl
 import functools
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from consat.network.deploy import output
 from consat.network.deploy.fleet import Event, Fleet, free_ports
 from consat.network.node.part import Part, split
 from consat.scenario import load
@@ -274,3 +277,40 @@ def test_an_agent_follows_its_sensor_under_its_speed_limit(tmp_path: Path) -> No
     assert (commands[-1]["velocity"], commands[-1]["valid_for"]) == ([0.0, 0.0], 0.5)
     assert {event["line"] for event in [*events, *rest] if event["event"] == "rejected"} == {"what is this", '{"position": [3, NaN]}'}
     np.testing.assert_allclose(events[-1]["velocity"], [-0.3, -0.4], atol=0.02)  # towards the disc, no faster than allowed
+
+
+def test_an_agent_whose_output_nobody_reads_goes_on_and_ends_when_told(tmp_path: Path) -> None:
+    (tmp_path / "solo.yaml").write_text(SOLO)
+    command = [*CONSAT, "agent", str(tmp_path / "solo.yaml"), "--id", "solo", "--sensor", "stdin", "--speed", "0.5", "--report", "0"]
+    with subprocess.Popen([*command, "--port", str(free_ports(1)[0])], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as agent:
+        try:
+            assert agent.stdin is not None
+            assert agent.stdout is not None
+            fcntl.fcntl(agent.stdout, fcntl.F_SETPIPE_SZ, 4096)
+            while json.loads(agent.stdout.readline())["event"] != "start":
+                pass
+            for _ in range(60):  # a report takes 400 bytes, and 100 of them come in a second
+                agent.stdin.write('{"position": [3, 4]}\n')
+                agent.stdin.flush()
+                time.sleep(0.05)
+            agent.send_signal(signal.SIGTERM)
+            assert agent.wait(10) == 0
+        finally:
+            agent.kill()
+
+
+def test_of_commands_that_wait_the_newest_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    free = threading.Event()
+    monkeypatch.setattr(output, "_write", lambda line: (written.append(line), free.wait(10)))
+    with output.Output() as out:
+        out.write({"event": "start"})
+        while not written:
+            time.sleep(0.01)
+        for k in range(5):
+            out.write({"event": "command", "k": k})
+            out.write({"event": "report", "k": k})
+        free.set()
+    told = [json.loads(line) for line in written]
+    assert [each["k"] for each in told if each["event"] == "report"] == [0, 1, 2, 3, 4]
+    assert [each["k"] for each in told if each["event"] == "command"] == [4]

@@ -268,6 +268,20 @@ def test_schedules_and_the_time_are_followed_and_can_begin_in_a_session() -> Non
     assert session.satisfied
 
 
+def test_nothing_is_claimed_of_constraints_that_were_not_in_force() -> None:
+    path = cs.schedule([0.0, 10.0], [[-2.0, 0.0], [-2.5, 0.0]])
+    session = cs.Session(trio(), rate=10)
+    session.change("a3", "goal", center=path).step(20)
+    assert session.known == "satisfied"
+    session.change("a1", "goal", center=[40.0, 0.0])
+    assert session.known is None, "nobody knows anything of the goal that has just moved"
+    assert session.margin < 0
+    result = session.step(20).result()
+    [only] = result.summary["verdicts"]
+    assert (only["from"], only["to"], only["verdict"]) == (2.0, 4.0, "infeasible")
+    assert f"{session.assess().bounds[1]:.4g}".replace("-", "−") in str(result).split("in the way")[1].split("Raising")[0], "the end's"
+
+
 def test_own_constraints_change_too() -> None:
     def disc(x: Any, *, at: Any, scale: Any) -> Any:
         return 1.0 - scale * jnp.sum((x - at) ** 2)

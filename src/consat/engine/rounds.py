@@ -442,9 +442,9 @@ def _ended() -> Callable[..., tuple[Report, Array]]:
 
 
 def _known(tally: Tally) -> Mapping[str, Any]:
-    """What all agents know at the end, and since when."""
-    if tally.known & SATISFIED:
-        return {"known": "satisfied", "known_from": tally.last_unknown + 1}
+    """What all agents know at the end, and since when. They judge by estimates: what does not hold at their positions is not known."""
+    if tally.known & SATISFIED and tally.last_bad < tally.done:
+        return {"known": "satisfied", "known_from": max(tally.last_unknown, tally.last_bad) + 1}
     if tally.known & INFEASIBLE:
         return {"known": "infeasible", "known_from": tally.infeasible_from}
     return {"known": None, "known_from": None}

@@ -143,10 +143,16 @@ class Team:
         trace(entries, self.dimension, faults)
         return [part for part, *_ in made if len(part.owner)]
 
+    def _copied(self) -> Team:
+        """A copy without what was computed of the constraints and agents, which are to be replaced."""
+        team = copy.copy(self)
+        for name in ("constraints_per_agent", "place", "slots"):
+            team.__dict__.pop(name, None)
+        return team
+
     def with_constraints(self, families: Iterable[Family], owner: np.ndarray, names: Sequence[str]) -> Team:
         """The same agents and links with other constraints. They are not checked; arguments as the attributes of `Team`."""
-        team = copy.copy(self)
-        team.__dict__.pop("constraints_per_agent", None)
+        team = self._copied()
         team.families, team.owner, team.names, team.members = tuple(families), owner, names, None
         return team
 
@@ -239,8 +245,7 @@ class Team:
                     tracks=kept.tracks,
                 )
             )
-        team = copy.copy(self)
-        team.__dict__.pop("constraints_per_agent", None)
+        team = self._copied()
         team.ids, team.starts, team.members, team.around = Chosen(self.ids, agents), self.starts[agents], None, None
         team.families, team.owner, team.names = assemble([part for part in parts if len(part.owner)])
         links = place[self.links]

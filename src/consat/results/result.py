@@ -144,6 +144,8 @@ class Result:
         from consat.certify.optimum import max_min
         from consat.certify.reasons import explain
 
+        if over_time := self.summary.get("verdicts"):
+            team = team.at(over_time[-1]["to"])  # the verdict is of the end
         return explain(team, max_min(team))
 
     def _repr_html_(self) -> str:

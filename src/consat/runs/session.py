@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -141,6 +141,7 @@ class Session:
         self._state: Now = state
         self._tally, self._record = Tally(), Memory()
         self._own_margins: np.ndarray | None = None
+        self._changed_at, self._stepped = 0, True
         self._take(chunk)
 
     # ---- stepping -----------------------------------------------------------------------------------------------------------------------
@@ -171,7 +172,7 @@ class Session:
         count = len(numbers)
         kept = [leaf[:count] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound, chunk.kept.position, chunk.kept.agent_margin)]
         margin, smooth, bound, position, margins = kept
-        self._own_margins, self._positions = margins[-1], position[-1]
+        self._own_margins, self._positions, self._stepped = margins[-1], position[-1], True
         chosen = numbers % self._record.every == 0
         if chosen.any():
             heading = None if self._body.drive is None else chunk.kept.heading[:count]
@@ -226,9 +227,9 @@ class Session:
         return self.margin > 0
 
     @property
-    def known(self) -> str | None:
+    def known(self) -> Literal["satisfied", "infeasible"] | None:
         """What every agent knows by itself about the team: ``satisfied``, ``infeasible`` or None."""
-        return known_of(self._tally)
+        return known_of(self._tally) if self._stepped else None
 
     # ---- changing -----------------------------------------------------------------------------------------------------------------------
 
@@ -259,7 +260,7 @@ class Session:
                 live[change.family][key][change.member] = value
             self._reach_out(change)
         self._note_changes({int(team.owner[change.number]) for change in changes})
-        self._own_margins = None
+        self._mark_change()
         return self
 
     @float64
@@ -280,7 +281,7 @@ class Session:
             raise InvalidTeam(faults)
         self._state = _placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
         self._positions = np.asarray(self._state.body)
-        self._own_margins = None
+        self._own_margins, self._stepped = None, False
         return self
 
     @float64
@@ -462,12 +463,14 @@ class Session:
             margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin, estimate=None, integral=None,
             holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
             satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
-            floats_sent=tally.floats, bytes=tally.bytes, known=known_of(tally), known_from=None,
+            floats_sent=tally.floats, bytes=tally.bytes, known=self.known, known_from=None,
             seconds={"compile": 0.0, "run": 0.0}, period=period,
             bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
         )  # fmt: skip
         scenario = dataclasses.replace(scenario_of(team), name=self._name)
-        summary = summarise(scenario, ready.settings, ready.schedule, ready.size, trace, robots=self._options.robots)
+        summary = summarise(
+            scenario, ready.settings, ready.schedule, ready.size, trace, robots=self._options.robots, since=self._changed_at * period
+        )
         return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
     def __repr__(self) -> str:
@@ -475,6 +478,10 @@ class Session:
         return f"<Session of {self._name}: {team.count} agents, round {self.round}, margin {self.margin:.4g}>"
 
     # ---- inside -------------------------------------------------------------------------------------------------------------------------
+
+    def _mark_change(self) -> None:
+        """What was found out of the team before holds no more."""
+        self._own_margins, self._changed_at, self._stepped = None, self.round, False
 
     @float64
     def _margins(self) -> np.ndarray:
@@ -524,7 +531,9 @@ class Session:
         # the session is modified only below, where no error can be raised
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
-        self._engine, self._state, self._positions, self._own_margins, self._body = engine, state, place, margins, body
+        self._engine, self._state, self._positions, self._body = engine, state, place, body
+        self._mark_change()
+        self._own_margins = margins
         self._extent = max(self._extent, ready.size.extent / ready.size.length)
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ NEARLY = 1e-3
 
 def summarise(
     scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, *, full: bool = False,
-    robots: Robots | None = None,
+    robots: Robots | None = None, since: float = 0.0,
 ) -> dict[str, Any]:  # fmt: skip
     """The document that ``run --json`` prints (schema consat.run/1).
 
@@ -43,6 +43,7 @@ def summarise(
         trace: trace of the run.
         full: whether to list every agent, also above `MOST_LISTED` agents.
         robots: the robots; None for points.
+        since: the time from which the constraints of the scenario were in force, s; verdicts over time begin there.
     """
     whole, position = scenario.team, trace.end
     team = whole.at(float(trace.steps[-1]) * (trace.period or 1.0))
@@ -80,7 +81,7 @@ def summarise(
         "agents": _agents(team, margins, multipliers, trace.violated) if listed else None,
         "clusters": _clusters(team, trace.cluster) if listed else None,
         "motion": trace.motion,
-        "verdicts": _verdicts(whole, trace) if whole.moves else None,
+        "verdicts": _verdicts(whole, trace, since) if whole.moves else None,
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
         "warnings": warnings_of(
@@ -91,8 +92,8 @@ def summarise(
     } | ({"robots": None, "obstacles": None} if robots is None else robots.told)
 
 
-def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:
-    """Certified verdicts over the time of a run; see `consat.runs.verdicts`."""
+def _verdicts(team: Team, trace: Trace, since: float) -> list[dict[str, Any]]:
+    """Certified verdicts over the time of a run from `since`, s; see `consat.runs.verdicts`."""
     period = trace.period or 1.0
     recorded = trace.recorded is None and trace.file is None
 
@@ -102,7 +103,7 @@ def _verdicts(team: Team, trace: Trace) -> list[dict[str, Any]]:
         k = int(np.searchsorted(trace.steps * period, time + 0.5 * period)) - 1
         return np.asarray(trace.position[max(k, 0)])
 
-    return verdicts(team, float(trace.steps[-1]) * period, seen)
+    return verdicts(team, float(trace.steps[-1]) * period, seen, since=since)
 
 
 def status_of(ending: str, margin: float, upper: float | None, psi: float) -> str:

@@ -43,7 +43,12 @@ class Instant(NamedTuple):
 
 
 def verdicts(
-    team: Team, duration: float, seen: Callable[[float], np.ndarray | None], progress: Callable[[float], None] = lambda _: None
+    team: Team,
+    duration: float,
+    seen: Callable[[float], np.ndarray | None],
+    progress: Callable[[float], None] = lambda _: None,
+    *,
+    since: float = 0.0,
 ) -> list[dict[str, Any]]:
     """Intervals that cover a run, for ``run --json``. Each has ``from`` and ``to``, s, ``verdict``, and ``bounds`` over the interval.
 
@@ -52,10 +57,11 @@ def verdicts(
         duration: duration of the run, s.
         seen: returns the positions in the run at about a given time, s, (N, d), as a candidate; None where they are not recorded.
         progress: called with the fraction done.
+        since: where the intervals begin, s.
     """
     samples = int(np.clip(COSTLY // max(team.count, 1), 8, SAMPLES))
-    knots = team.knots[(team.knots > 0) & (team.knots < duration)]
-    times = np.unique(np.concatenate([np.linspace(0.0, duration, samples + 1), knots])) if duration > 0 else np.zeros(1)
+    knots = team.knots[(team.knots > since) & (team.knots < duration)]
+    times = np.unique(np.concatenate([np.linspace(since, duration, samples + 1), knots])) if duration > since else np.array([duration])
     found = []
     for k, time in enumerate(times.tolist()):
         found.append(certify(team, time, seen(time)))

@@ -9,10 +9,8 @@ If the agent ends for any reason, or loses its sensor, its last command is zero 
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -27,6 +25,7 @@ import numpy as np
 
 from consat.errors import InvalidInput, InvalidSettings, InvalidTeam
 from consat.faults import Faults
+from consat.network.deploy.output import Output
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
 from consat.network.node.core import Embodied, Moment
 from consat.network.node.helm import Helm
@@ -117,16 +116,16 @@ def run_agent(part: Part, manner: Manner, options: ProcessOptions, again: Callab
     if part.team.moves and part.epoch is None and manner.mode != "lockstep" and not reading:
         raise InvalidSettings("constraints move with time, but nobody says when t = 0 is; say --epoch, to all agents the same")
     orders = Orders(None if measured is None else dimension, reading=reading)
-    with heeding_signals(orders):
-        helm = Helm(part.me, dimension, measured, options.sensor_timeout, _write)
+    with Output() as output, heeding_signals(orders):
+        helm = Helm(part.me, dimension, measured, options.sensor_timeout, output.write)
         core = core_of(part, manner)
         _warm(core)
         begin = Anew(part, core, Membership(part))
-        told = _wait_to_join(begin, orders, again) if options.standby else begin
+        told = _wait_to_join(begin, orders, again, output.write) if options.standby else begin
         end = math.inf if options.until is None else time.monotonic() + options.until
         try:
             with ThreadPoolExecutor(1) as reader:
-                own = _Own(body, orders, helm, again, reader, deque(), end)
+                own = _Own(body, orders, helm, again, reader, deque(), end, output.write)
                 while isinstance(told, Anew):
                     told = _live(told, manner, options, own)
         except BaseException:
@@ -145,6 +144,7 @@ class _Own(NamedTuple):
         reader: thread that reads and compiles a new part.
         reading: the reload order in progress, with its future result; at most one.
         end: time on the monotonic clock at which the process ends, s.
+        write: writes an event.
     """
 
     body: Body
@@ -154,6 +154,7 @@ class _Own(NamedTuple):
     reader: Executor
     reading: deque[tuple[Order, Future[tuple[Part, Embodied] | str]]]
     end: float
+    write: Callable[[dict[str, Any]], None]
 
 
 def _live(begin: Anew, manner: Manner, options: ProcessOptions, own: _Own) -> Anew | str:
@@ -161,7 +162,7 @@ def _live(begin: Anew, manner: Manner, options: ProcessOptions, own: _Own) -> An
     part = begin.part
     with _transport(part, manner, options) as transport:
         runner = runner_of(
-            part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=_write,
+            part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=own.write,
             core=begin.core,
         )  # fmt: skip
         station = runner.station
@@ -279,12 +280,14 @@ def _heed(runner: Runner, order: Order) -> str | None:
     return None
 
 
-def _wait_to_join(begin: Anew, orders: Orders, again: Callable[[], Part] | None) -> Anew | str:
+def _wait_to_join(
+    begin: Anew, orders: Orders, again: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
+) -> Anew | str:  # fmt: skip
     """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
     part, core = begin.part, begin.core
 
     def write(event: str, **details: Any) -> None:
-        _write({"event": event, "id": part.me, "t": time.monotonic(), **details})
+        out({"event": event, "id": part.me, "t": time.monotonic(), **details})
 
     write("standby", pid=os.getpid())
     while not orders.stopped and not orders.leaving:
@@ -351,8 +354,3 @@ def _protected(address: str) -> str:
     """The address with TLS instead of TCP. A TLS address stays as it is."""
     kind, _, rest = address.partition("/")
     return f"tls/{rest}" if kind == "tcp" else address
-
-
-def _write(event: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event) + "\n")
-    sys.stdout.flush()
