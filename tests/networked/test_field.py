@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -168,7 +169,7 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     def transport(*_: Any) -> Iterator[Any]:
         yield Waiting(MemoryNetwork().endpoint("solo", []))
 
-    monkeypatch.setattr(process, "_write", made.take)
+    monkeypatch.setattr(process, "Output", lambda: nullcontext(SimpleNamespace(write=made.take)))
     monkeypatch.setattr(process, "_transport", transport)
     with os.fdopen(read) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
