@@ -65,8 +65,9 @@ class Admm:
         share: fraction of the stiffness of f_i that ρ_i moves towards.
         least: lower bound on ρ_i, as a fraction of the initial ρ. Agents with room to spare have almost no stiffness.
         rise: relative increase of ρ_i in a round, at most.
-        hurry: factor of an additional increase, `hurry` · `rise`, where f_i ≥ 1 (constraints violated). Agents with separation constraints
-            can circle about each other; a stiffer penalty breaks that cycle.
+        hurry: factor of an additional increase, `hurry` · `rise`, where f_i ≥ 1 (constraints violated) and some ψ are not concave: agents
+            with separation constraints can circle about each other, and a stiffer penalty breaks that cycle. Where all are concave it kept
+            a formation of 100 from being satisfied.
         fall: relative decrease of ρ_i, at most, in the time a message needs to cross the team, once all are known to be satisfied.
         horizon: number of such crossings after which changes of ρ fade out, so that the convergence proof for fixed ρ applies.
         tolerance: with ``sends=events``, largest difference between a point and what the neighbour holds, in the team's unit of length.
@@ -116,7 +117,8 @@ class Admm:
         goal = jax.lax.cond(jnp.any(unread), followed, lambda: stiff)
         least, across = self.least * self.penalty / solver.length**2, max(solver.hops, 1)
         horizon = self.horizon * across
-        rise = self.rise * (1.0 + self.hurry * jnp.exp(jnp.minimum(memory.sigma, 0.0))) / (1.0 + (round_ / horizon) ** 4)
+        hurry = 0.0 if solver.convex else self.hurry
+        rise = self.rise * (1.0 + hurry * jnp.exp(jnp.minimum(memory.sigma, 0.0))) / (1.0 + (round_ / horizon) ** 4)
         fall = jnp.where(known.satisfied > 0, self.fall / across / (1.0 + (known.satisfied / horizon) ** 4), 0.0)
         lowest = wish * (1.0 - solver.to_rows(fall)) if solver.convex else wish
         wish = jnp.clip(jnp.maximum(goal, least), lowest, wish * (1.0 + solver.to_rows(rise)))
