@@ -56,7 +56,7 @@ def _curve(
 ) -> None:
     points = []
     for stage in stages:
-        measured = stage.results.get((method, (box, loss)))
+        measured = stage.results.get((method, (box, loss, 0.0)))  # a Condition, with nobody asleep
         if stage.problem.family != family or measured is None:
             continue
         taken = measured.satisfied[np.isfinite(measured.satisfied)]
