@@ -544,6 +544,8 @@ def page(parts: dict[str, Any]) -> str:
         told += [f"## {heading}", about, "\n".join(table(part["rows"]))]
         if name == "obstacles" and "crowds" in parts:
             told.append("![consat's times against ORCA's, and ways among shelves](robots.png)")
+            told.append("![eight unicycles on a circle swap places](../figures/swap.gif)")
+            told.append("The film: `consat run swap --out swap && consat export swap --to swap.gif`.")
         told.append(f"`python benchmarks/robots.py --part {name}`{short}: {when}.")
     return "\n\n".join(told) + "\n"
 
