@@ -3,7 +3,9 @@
 Compiled programs are kept where the command line keeps them, so that workers, the processes that tests start, and the next run share them.
 """
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before the first import of JAX and matplotlib, and in the environment, so that subprocesses have them too.
@@ -17,6 +19,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import hypothesis
 import jax
+import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -25,3 +28,16 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None, database=None)
 hypothesis.settings.register_profile("hunt", max_examples=2000, deadline=None)
 hypothesis.settings.load_profile("seeded")
+
+ROOM = 3 * 2**30
+"""Memory that a worker may hold between two modules, bytes."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room() -> Iterator[None]:
+    """A worker that has compiled hundreds of programs holds gigabytes, and has crashed: beyond `ROOM` it drops them."""
+    yield
+    pages = Path("/proc/self/statm")
+    if pages.exists() and int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > ROOM:
+        jax.clear_caches()
+        gc.collect()

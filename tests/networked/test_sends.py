@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from consat.scenario import load
 
 
 def rehearse(manner: Manner, conditions: Faults = Faults(), seed: int = 0) -> Rehearsal:  # noqa: B008
-    team = Rehearsal(split(load("case-c"), run="sends"), manner, MemoryNetwork(conditions, seed=seed))
+    team = Rehearsal(split(load("case-c"), run="sends"), manner, MemoryNetwork(replace(conditions, seed=seed)))
     team.start()
     return team
 
