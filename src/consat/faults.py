@@ -99,6 +99,12 @@ Part = tuple[int, Array | None]
 """How many there are in the whole team, and the indices of those that this process has; None for all."""
 
 
+def _uniform(key: Array, of: Part) -> Array:
+    count, own = of
+    draws = jax.random.uniform(key, (count,))
+    return draws if own is None else draws[own]
+
+
 def draw(
     key: Array, bad: Array | None, *, loss: Array, sleep: Array, burst: Array | None, agents: Part, pairs: Part
 ) -> Draw:  # fmt: skip
@@ -114,13 +120,9 @@ def draw(
         pairs: the directed pairs of agents between which messages travel.
     """
     key, draw_loss, draw_sleep = jax.random.split(key, 3)
-    awake, through = (
-        draws if own is None else draws[own]
-        for draws, own in ((jax.random.uniform(k, (count,)), own) for k, (count, own) in ((draw_sleep, agents), (draw_loss, pairs)))
-    )
-    arrives = through >= loss
+    arrives = _uniform(draw_loss, pairs) >= loss
     if bad is not None and burst is not None:
         turns = jax.random.uniform(jax.random.fold_in(draw_loss, 1), bad.shape)
         bad = jnp.where(bad, turns >= burst[1], turns < burst[0])
         arrives &= ~bad
-    return Draw(key, awake >= sleep, arrives, bad)
+    return Draw(key, _uniform(draw_sleep, agents) >= sleep, arrives, bad)

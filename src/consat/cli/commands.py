@@ -29,6 +29,7 @@ from consat.cli.terminal import (
     INVALID,
     UNSATISFIED,
     USAGE,
+    Burst,
     estimates_option,
     force_option,
     full_option,
@@ -145,7 +146,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end earlier.")
 @click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
 @click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that an agent skips a round.")
-@click.option("--burst", callback=_numbers, metavar="P,Q", help="Links turn bad with probability P a round, good again with Q.")
+@click.option("--burst", type=Burst(), help="Links turn bad with probability P a round, good again with Q.")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, where rounds take time.")
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
 @click.option(
@@ -192,7 +193,6 @@ def run(
     loaded = None if scenario is None else _load(scenario, overrides)
     from consat.runs import runner
 
-    settings["burst"] = settings["burst"] or None
     with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, located(loaded):
         if loaded is None:
             kept = {key: settings[key] for key in ("rounds", "until", "checkpoint")}

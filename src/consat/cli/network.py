@@ -11,6 +11,7 @@ import click
 from consat.cli.completion import agents, protocols
 from consat.cli.terminal import (
     DONE,
+    Burst,
     estimates_option,
     force_option,
     full_option,
@@ -75,19 +76,6 @@ class _Delay(click.ParamType[tuple[float, float]]):
         return ends[0], ends[-1]
 
 
-class _Burst(click.ParamType[tuple[float, float]]):
-    """Type of an option: two probabilities ``P,Q``."""
-
-    name = "P,Q"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        try:
-            p, q = value if isinstance(value, tuple) else map(float, str(value).split(","))
-        except ValueError:
-            self.fail(f"it is {value!r}, but must be two probabilities, such as 0.05,0.5", param, ctx)
-        return p, q
-
-
 class _Position(click.ParamType[tuple[float, ...]]):
     """Type of an option: numbers separated by commas."""
 
@@ -106,7 +94,7 @@ class _Position(click.ParamType[tuple[float, ...]]):
 
 
 burst_option = click.option(
-    "--burst", type=_Burst(), metavar="P,Q", help="What arrives turns bad with probability P a message, good again with Q; bad is lost."
+    "--burst", type=Burst(), help="What arrives turns bad with probability P a message, good again with Q; bad is lost."
 )
 delay_option = click.option("--delay", type=_Delay(), default=(0.0, 0.0), help="How long to hold messages back where they arrive, s.")
 

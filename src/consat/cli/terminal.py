@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,20 @@ if TYPE_CHECKING:
     from consat.scenario import Scenario
 
 DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+
+class Burst(click.ParamType[tuple[float, float]]):
+    """Type of an option: two probabilities ``P,Q``."""
+
+    name = "P,Q"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        try:
+            p, q = value if isinstance(value, tuple) else map(float, str(value).split(","))
+        except ValueError:
+            self.fail(f"it is {value!r}, but must be two probabilities, such as 0.05,0.5", param, ctx)
+        return p, q
+
 
 scenario_argument = click.argument("scenario", metavar="FILE", shell_complete=scenarios)
 set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")

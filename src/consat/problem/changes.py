@@ -165,7 +165,7 @@ def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) 
     where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
     faults: list[Fault] = []
     values: dict[str, Moving] = {}
-    allowed = adjustable(family.kind, family.psi, {key: np.asarray(value)[0] for key, value in family.parameters.items()})
+    allowed = adjustable(family.kind, family.psi, family.parameters)
     for key, value in given.items():
         if key not in allowed and key != "weight":
             names = ", ".join([*allowed, "weight"])

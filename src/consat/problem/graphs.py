@@ -144,25 +144,23 @@ def hops(count: int, links: np.ndarray) -> int:
 def loop_length(count: int, links: np.ndarray) -> float:
     """Mean length of the loops that links form, in links; 0 where they form none.
 
-    What hangs on the loops as a tree is left out. The rest has E links, each in two of F = E − N + C + 1 faces, C components: the mean is
-    2E/F (Euler's formula). It is exact for a graph that can be drawn without crossings, such as a ring (N) or a square lattice (about 4).
+    What hangs on the loops as a tree is left out. The rest has E links, each in two of its faces, one more than independent loops (Euler's
+    formula). It is exact for a graph that can be drawn without crossings, such as a ring (N) or a square lattice (about 4).
 
     Args:
         count: N, number of agents.
         links: (L, 2) undirected links, each once.
     """
-    while len(links):
+    whole = coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count))
+    loops = len(links) - count + int(connected_components(whole, directed=False, return_labels=False))
+    if not loops:
+        return 0.0
+    kept = np.zeros(len(links), dtype=bool)
+    while not kept.all():
         degree = np.bincount(links.ravel(), minlength=count)
         kept = (degree[links] > 1).all(axis=1)
-        if kept.all():
-            break
         links = links[kept]
-    if not len(links):
-        return 0.0
-    agents = np.unique(links)
-    parts = connected_components(coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count)), directed=False)[1][agents]
-    faces = len(links) - len(agents) + len(np.unique(parts)) + 1
-    return 2.0 * len(links) / faces
+    return 2.0 * len(links) / (loops + 1)
 
 
 def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

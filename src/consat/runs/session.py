@@ -527,13 +527,11 @@ class Session:
         if robots is not None and self._state.robots is not None and body.drive is not None:
             robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
         state = state._replace(state=_begun_anew(inner), body=on_device(place), key=self._state.key, robots=robots)
-        margins = np.asarray(_agent_margins(engine.carrier.world, state, float(self.round)))
         # the session is modified only below, where no error can be raised
         self._record = _renamed(self._record, names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
         self._engine, self._state, self._positions, self._body = engine, state, place, body
         self._mark_change()
-        self._own_margins = margins
         self._extent = max(self._extent, ready.size.extent / ready.size.length)
 
     def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:

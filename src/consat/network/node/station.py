@@ -76,7 +76,8 @@ class Station:
     ) -> None:
         self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
         self.membership = Membership(part)
-        self._beat, self._sieve = beat, None if beat is None else Sieve(core, beat)
+        self._beat = beat
+        self._sieve = self._new_sieve()
         self._letters = {} if beat is None else _brief(part, core)
         self.peers = Peers(
             part,
@@ -112,6 +113,10 @@ class Station:
         """(d,) target of the body; None before the first step."""
         self.regroup(None, part.first)
 
+    def _new_sieve(self) -> Sieve | None:
+        """Chooses what is sent for the core as it is now; None if everything is."""
+        return None if self._beat is None else Sieve(self.core, self._beat)
+
     # -- membership --------------------------------------------------------------------------------------------------------------------
 
     @property
@@ -132,7 +137,7 @@ class Station:
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
             before, self.core = self.core, self.core.among(gone)
-            self._sieve = None if self._beat is None else Sieve(self.core, self._beat)
+            self._sieve = self._new_sieve()
             self._gone, self._look = gone, None
             if state is not None:
                 state = self.core.carry(before, state, self.among(first), self._time)
@@ -211,7 +216,7 @@ class Station:
         else:
             self.part = replace(self.part, team=changed(team, changes))
             self.core = before.among(self._gone, self.part)
-            self._sieve = None if self._beat is None else Sieve(self.core, self._beat)
+            self._sieve = self._new_sieve()
             state = state and self.core.carry(before, state, self.among(self.first()), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state

@@ -241,7 +241,7 @@ def farthest(psi: Callable[..., Any], parameters: Mapping[str, np.ndarray], cent
     return float(away.max(initial=0.0))
 
 
-def adjustable(kind: str, psi: Callable[..., Any], values: Mapping[str, Any]) -> Mapping[str, Parameter]:
+def adjustable(kind: str, psi: Callable[..., Any], parameters: Mapping[str, Any]) -> Mapping[str, Parameter]:
     """The parameters of a constraint that can be changed while a team runs, and what their values must satisfy.
 
     None for a text expression, because its numbers have no names. Other kinds are asked through their factory in `KINDS`.
@@ -249,13 +249,13 @@ def adjustable(kind: str, psi: Callable[..., Any], values: Mapping[str, Any]) ->
     Args:
         kind: kind of the constraint.
         psi: its function.
-        values: its parameters.
+        parameters: of a family of such constraints, with leading axis M ≥ 1.
     """
     if isinstance(psi, Formula):
         return {}
     if psi in ADJUSTABLE:
         return ADJUSTABLE[psi]
-    free = {key: value for key, value in values.items() if key != "t"}
+    free = {key: np.asarray(value)[0] for key, value in parameters.items() if key != "t"}
     if kind in KINDS:
         arguments = inspect.signature(KINDS[kind]).parameters
         if free.keys() <= arguments.keys():
