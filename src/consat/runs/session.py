@@ -23,11 +23,11 @@ from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Body, Now, World, world_of
 from consat.engine.rounds import Tally, driven, known_of
-from consat.errors import Fault, InvalidSettings, InvalidTeam, shown
+from consat.errors import Fault, InvalidSettings, InvalidTeam
 from consat.numerics import float64, on_device
-from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, named, place_of
+from consat.problem import structure
+from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, place_of
 from consat.problem.constraints.library import ADJUSTABLE, farthest
-from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import vector
@@ -295,22 +295,10 @@ class Session:
         Raises:
             InvalidTeam: the agent does not fit the team; the session is unchanged.
         """
-        team = self.team
-        known = set(team.ids)
-        if not isinstance(agent, Agent):
-            raise InvalidTeam([Fault((), f"{shown(agent)} is no agent; give a consat.Agent", "add")])
-        given = None if links is None else [links] if isinstance(links, str) else list(links)
-        joined = [*team.agents, agent]
-        ends = [(agent.id, other) for other in given or ()]
-        new = _like(team, joined, ends)
-        if given is None:
-            i = new.count - 1
-            read = {int(j) for family in new.families for j in np.unique(family.agents[family.owner == i])} - {i}
-            ends = [(agent.id, new.ids[j]) for j in sorted(read)]
-            new = _like(team, joined, ends)
-        if agent.start is None and (near := [other for _, other in ends if other in known]):
-            middle = np.mean([self._positions[self._place_of(other)] for other in near], axis=0)
-            new.starts[-1] = middle
+        new = structure.with_agent(self.team, agent, links)
+        near = [k for i, j in new.links.tolist() for k in (i, j) if new.count - 1 in (i, j) and k != new.count - 1]
+        if agent.start is None and near:
+            new.starts[-1] = np.mean([self._positions[self._place_of(new.ids[k])] for k in near], axis=0)
         self._restructure(new)
         return self
 
@@ -321,13 +309,7 @@ class Session:
         Raises:
             InvalidTeam: unknown agent, the last agent, or the remaining agents would not be connected; the session is unchanged.
         """
-        i, team = self._place_of(agent), self.team
-        if team.count == 1:
-            raise InvalidTeam([Fault((), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
-        stays = np.delete(np.arange(team.count), i)
-        new, _ = team.part(stays)
-        self._require_connected(new, f"without agent {agent!r}")
-        self._restructure(new)
+        self._restructure(structure.without_agent(self.team, agent))
         return self
 
     @float64
@@ -337,11 +319,7 @@ class Session:
         Raises:
             InvalidTeam: unknown agents, or the link exists; the session is unchanged.
         """
-        pair, team = self._pair(one, other), self.team
-        if self._linked(team, pair):
-            raise InvalidTeam([Fault((), "they are linked already", f"link [{one}, {other}]")])
-        links = np.concatenate([team.links, np.array([pair], dtype=np.int32)])
-        self._restructure(team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))]))
+        self._restructure(structure.with_link(self.team, one, other))
         return self
 
     @float64
@@ -351,11 +329,8 @@ class Session:
         Raises:
             InvalidTeam: no such link, or agents that depend on each other would not be connected without it; the session is unchanged.
         """
-        pair, team = self._pair(one, other), self.team
-        if not self._linked(team, pair):
-            raise InvalidTeam([Fault((), "there is no such link", f"link [{one}, {other}]")])
-        new = team.with_links(team.links[~(team.links == np.array(pair)).all(axis=1)])
-        self._require_connected(new, f"without the link [{one}, {other}]")
+        new = structure.without_link(self.team, one, other)
+        structure.connected(new, f"without the link [{one}, {other}]")
         self._restructure(new)
         return self
 
@@ -371,10 +346,7 @@ class Session:
             InvalidTeam: the constraint does not fit the team, or reads an agent that is not connected to the owner; the session is
                 unchanged.
         """
-        i, team = self._place_of(agent), self.team
-        agents = list(team.agents)
-        agents[i] = dataclasses.replace(agents[i], constraints=[*flatten(agents[i].constraints), constraint])
-        self._restructure(_like(team, agents))
+        self._restructure(structure.with_constraint(self.team, agent, constraint))
         return self
 
     @float64
@@ -384,12 +356,7 @@ class Session:
         Raises:
             InvalidTeam: unknown agent or constraint; the session is unchanged.
         """
-        team, i = self.team, self._place_of(agent)
-        numbers = named(team, agent, constraint)
-        gone = {team.names[number] for number in numbers}
-        agents = list(team.agents)
-        agents[i] = dataclasses.replace(agents[i], constraints=[each for each in flatten(agents[i].constraints) if each.name not in gone])
-        self._restructure(_like(team, agents))
+        self._restructure(structure.without_constraint(self.team, agent, constraint))
         return self
 
     @float64
@@ -404,7 +371,7 @@ class Session:
         """
         if team.dimension != self.dimension:
             raise InvalidTeam([Fault(("dimension",), f"dimension is {team.dimension}, but must stay {self.dimension}", "dimension")])
-        self._require_connected(team, "the team")
+        structure.connected(team, "the team")
         self._restructure(team)
         return self
 
@@ -550,23 +517,6 @@ class Session:
     def _place_of(self, agent: str) -> int:
         return place_of(self._engine.ready.team, agent)
 
-    def _pair(self, one: str, other: str) -> tuple[int, int]:
-        i, j = self._place_of(one), self._place_of(other)
-        if i == j:
-            raise InvalidTeam([Fault((), "an agent is not linked to itself; name another", f"agent {one!r}")])
-        return min(i, j), max(i, j)
-
-    @staticmethod
-    def _linked(team: Team, pair: tuple[int, int]) -> bool:
-        return bool((team.links == np.array(pair)).all(axis=1).any())
-
-    @staticmethod
-    def _require_connected(team: Team, without: str) -> None:
-        try:
-            require_connected(team)
-        except InvalidTeam as error:
-            raise InvalidTeam([dataclasses.replace(fault, where=without) for fault in error.faults]) from None
-
     def _bends_otherwise(self, team: Team) -> bool:
         """Whether the compiled curvature of a user-defined constraint is not valid for a team with other parameters."""
         before = self._engine.ready.team
@@ -612,11 +562,6 @@ def assessed(team: Team) -> Assessment:
     best, found = judged(team)
     lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
     return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
-
-
-def _like(team: Team, agents: Sequence[Agent], links: Sequence[tuple[str, str]] = ()) -> Team:
-    """Team with the agents `agents` and additional links, other properties as in `team`."""
-    return Team(agents, [*team.linked, *links], team.dimension, unit=team.unit)
 
 
 def _begun_anew(state: Any) -> Any:
