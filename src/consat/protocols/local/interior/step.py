@@ -18,6 +18,7 @@ from consat.numerics import on_device
 from consat.problem.units import Scale
 from consat.protocols.local.interior.algebra import gram, reduced, solve, spread, times
 from consat.protocols.local.interior.layout import Batch, Kind
+from consat.protocols.local.lanewise import along, arguments
 
 NUDGE = 1e-3
 """Copies start at this fraction of the way from the agent's own position to the initial estimate, so that no two copies coincide."""
@@ -186,14 +187,14 @@ class Lanes:
 
     def psi(self, y: Array) -> Array:
         """(m, A) ψ at the copies `y`, (n, d, A), the cap last; −∞ outside the domain of ψ, +∞ where padded."""
-        own = [self._masked(kind, _along(_at(form.psi))(self._arguments(kind, y), kind.parameters)) for form, kind in self._each()]
+        own = [self._masked(kind, along(_at(form.psi))(self._arguments(kind, y), kind.parameters)) for form, kind in self._each()]
         return self._with_cap(own)
 
     def slopes(self, y: Array) -> tuple[Array, Array]:
         """(m, A) ψ and (m, n·d, A) ∇ψ at the copies `y`, (n, d, A); entries of ∇ψ that are not finite are 0."""
         values, gradients = [], []
         for form, kind in self._each():
-            value, found = _along(jax.value_and_grad(_at(form.psi)))(self._arguments(kind, y), kind.parameters)
+            value, found = along(jax.value_and_grad(_at(form.psi)))(self._arguments(kind, y), kind.parameters)
             slope = found * (kind.weight * self.units.length / self.units.psi)[:, None, None]
             values.append(self._masked(kind, value))
             gradients.append(self._placed(kind, jnp.where(jnp.isfinite(slope) & kind.used[:, None, None], slope, 0.0)))
@@ -223,7 +224,7 @@ class Lanes:
                 rank, values, found = 0, jnp.zeros((m, 0, count)), jnp.zeros((m, 0, arity, d, count))
             else:
                 rank = arity * d
-                values, found = _along(_bend(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)
+                values, found = along(_bend(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)
             if rank:
                 rows = jnp.repeat(kind.slots, rank, axis=0, total_repeat_length=m * rank)
                 which += [done + k for k in range(m) for _ in range(rank)]
@@ -244,10 +245,7 @@ class Lanes:
 
     def _arguments(self, kind: Kind, y: Array) -> Array:
         """(m, arity, d, A) the arguments of each ψ, in the scenario's units."""
-        x = self.units.center[None, :, None] + self.units.length * y
-        m, arity, count = kind.slots.shape
-        found = jnp.take_along_axis(x, kind.slots.reshape(m * arity, 1, count), axis=0)
-        return found.reshape(m, arity, self.shape[1], count)
+        return arguments(self.units.center[None, :, None] + self.units.length * y, kind.slots)
 
     def _placed(self, kind: Kind, slope: Array) -> Array:
         """(m, arity, d, A) → (m, n·d, A): from the arguments of each constraint to the agent's coordinates."""
@@ -259,11 +257,6 @@ class Lanes:
 def _at(psi: Any) -> Any:
     """ψ as a function of an array of positions, (arity, d), and a dictionary of parameters."""
     return lambda x, p: psi(*x, **p)
-
-
-def _along(function: Any) -> Any:
-    """Vectorise a function of one constraint of one agent over the constraints (first axis) and the agents (last axis)."""
-    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1))
 
 
 def _bend(psi: Any, arity: int, d: int) -> Any:
