@@ -33,6 +33,7 @@ import numpy as np
 import consat as cs
 from consat.certify.quadratics import shape_of
 from consat.engine import round as kernel
+from consat.engine.world import World, world_of
 from consat.engine.chunks import CHUNK
 from consat.engine.flows import Problem, rate
 from consat.faults import Faults
@@ -108,12 +109,12 @@ def measure(name: str, count: int) -> Row:
     team, size = scenario.team, scale(scenario.team)
     copies, nu = Estimates.of(team, "local"), SmoothingSchedule.of(automatic(size)).final
     convex = bool(shape_of(team).concave.all())
-    world = kernel.world_of(team, copies, nu, size, convex=convex, faults=Faults(), body=None)
+    world = world_of(team, copies, nu, size, convex=convex, faults=Faults(), body=None)
     first = jnp.asarray(first_estimates(team, copies, scenario.settings.start, size))
     build, begin = time.perf_counter() - begin, time.perf_counter()
     protocol = ROUNDS["admm"]()
 
-    def rounds(world: kernel.World, now: kernel.Now, number: jax.Array) -> tuple[kernel.Now, jax.Array]:
+    def rounds(world: World, now: kernel.Now, number: jax.Array) -> tuple[kernel.Now, jax.Array]:
         return kernel.many_rounds(protocol, world, now, number + jnp.arange(BLOCK, dtype=float), lambda seen: seen.margin)
 
     now, _ = jax.jit(kernel.begin, static_argnames=("protocol",))(protocol, world, first, jax.random.key(0))

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.engine.round import Body, Seen, World, begin, many_rounds, world_of
+from consat.engine.bodies import Body
+from consat.engine.round import Seen, begin, many_rounds
+from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.objective import SmoothingSchedule
