@@ -28,7 +28,7 @@ import consat as cs
 from consat.engine.flows import CHUNK, Observer, Problem, _advance
 from consat.engine.recording import Choice
 from consat.numerics import float64
-from consat.problem.objective import Schedule
+from consat.problem.objective import SmoothingSchedule
 from consat.protocols import GradientFlow
 from consat.protocols.estimates import Estimates
 from tests import paper
@@ -86,7 +86,7 @@ def batch(starts: int) -> None:
     print(f"\n## {starts} random starts of case C to t = 300 s\n")
     team, settings = cs.load("case-c").team, cs.load("case-c").settings
     copies, flow = Estimates.of(team, "full"), GradientFlow()
-    problem = Problem.of(team, copies, Schedule.of(settings.smoothing))
+    problem = Problem.of(team, copies, SmoothingSchedule.of(settings.smoothing))
     observer = Observer.of(team, copies, Choice.of(team, copies))
     first = jnp.asarray(np.random.default_rng(0).uniform(-4, 4, (starts, copies.count, 2)))
     times = [jnp.asarray(part) for part in np.linspace(0, UNTIL, 3001)[np.arange(0, 3000, CHUNK)[:, None] + np.arange(CHUNK + 1)]]

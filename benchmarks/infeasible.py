@@ -33,7 +33,7 @@ from consat.certify.optimum import max_min
 from consat.engine.rounds import HOLD
 from consat.numerics import float64
 from consat.problem.graphs import hops
-from consat.problem.objective import Nu, Schedule
+from consat.problem.objective import Nu, SmoothingSchedule
 from consat.problem.units import automatic, scale
 
 mpl.use("Agg")
@@ -217,7 +217,7 @@ def smoothed(arrays: Arrays, x: np.ndarray, nu: Nu) -> float:
 def measure(shape: str, count: int, seed: int, cap: int) -> Case:
     """All methods on one team, from the same starts, (N, d); those on the smooth objective also from near its best formation."""
     one, team, formation = case(shape, count, seed)
-    arrays, nu, best = Arrays.of(team), Schedule.of(automatic(scale(team))).final, one.best
+    arrays, nu, best = Arrays.of(team), SmoothingSchedule.of(automatic(scale(team))).final, one.best
     one.smooth = smoothed(arrays, formation, nu)
     near = formation + np.random.default_rng(seed).uniform(-baselines.NEAR, baselines.NEAR, formation.shape)
     one.results["max-min"], x = consat(team, best, "max-min", 100 + 8 * one.hops, seed)

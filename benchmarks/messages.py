@@ -25,7 +25,8 @@ from families import FAMILIES
 from rounds import machine, table
 
 import consat as cs
-from consat.engine.round import SATISFIED, begin, many_rounds, world_of
+from consat.engine.round import SATISFIED, begin, many_rounds
+from consat.engine.world import world_of
 from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.units import scale

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.engine.round import Everyone
+from consat.engine.world import Everyone
 from consat.numerics import quick_compilation
 from consat.problem.objective import Nu
 

@@ -31,7 +31,7 @@ from pyrvo import RVOSimulator
 from scipy.spatial import cKDTree
 
 import consat
-from consat.engine.round import PATH, Driven
+from consat.engine.bodies import PATH, Driven
 from consat.engine.ways import Ways
 from consat.robots import Double, Drive, Point, Quadrotor, Unicycle, box, disc, simulated
 

@@ -33,11 +33,12 @@ from scipy.optimize import minimize
 from consat.certify.certificate import bounds
 from consat.certify.optimum import cluster_margins, max_min
 from consat.certify.quadratics import values_and_gradients
-from consat.engine.round import World, begin, many_rounds, world_of
+from consat.engine.round import begin, many_rounds
 from consat.engine.rounds import HOLD
+from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import Groups, float64, quick_compilation
-from consat.problem.objective import Nu, Objective, Schedule
+from consat.problem.objective import Nu, Objective, SmoothingSchedule
 from consat.problem.units import Scale, automatic, scale
 from consat.protocols import PAIRED, ROUNDS, Rounds
 from consat.protocols.estimates import Estimates
@@ -128,7 +129,7 @@ class Stage:
         """Args: problem: what; optima: whether to find the best of each instance centrally."""
         team = problem.team
         copies, size = Estimates.of(team, "local"), scale(team)
-        nu = Schedule.of(problem.smoothing or automatic(size)).final
+        nu = SmoothingSchedule.of(problem.smoothing or automatic(size)).final
         best, center, smooth = None, None, np.full(problem.seeds, np.nan)
         if problem.convex and optima:
             optimum = max_min(team)

@@ -33,11 +33,12 @@ import numpy as np
 import consat as cs
 from consat.certify.quadratics import shape_of
 from consat.engine import round as kernel
+from consat.engine.world import World, world_of
 from consat.engine.chunks import CHUNK
 from consat.engine.flows import Problem, rate
 from consat.faults import Faults
 from consat.numerics import float64, thorough_compilation
-from consat.problem.objective import Nu, Schedule
+from consat.problem.objective import Nu, SmoothingSchedule
 from consat.problem.units import automatic, scale
 from consat.protocols import FLOWS, ROUNDS, State
 from consat.protocols.estimates import Estimates
@@ -106,14 +107,14 @@ def measure(name: str, count: int) -> Row:
     begin = time.perf_counter()
     scenario = cs.load(name, [f"count={count}"])
     team, size = scenario.team, scale(scenario.team)
-    copies, nu = Estimates.of(team, "local"), Schedule.of(automatic(size)).final
+    copies, nu = Estimates.of(team, "local"), SmoothingSchedule.of(automatic(size)).final
     convex = bool(shape_of(team).concave.all())
-    world = kernel.world_of(team, copies, nu, size, convex=convex, faults=Faults(), body=None)
+    world = world_of(team, copies, nu, size, convex=convex, faults=Faults(), body=None)
     first = jnp.asarray(first_estimates(team, copies, scenario.settings.start, size))
     build, begin = time.perf_counter() - begin, time.perf_counter()
     protocol = ROUNDS["admm"]()
 
-    def rounds(world: kernel.World, now: kernel.Now, number: jax.Array) -> tuple[kernel.Now, jax.Array]:
+    def rounds(world: World, now: kernel.Now, number: jax.Array) -> tuple[kernel.Now, jax.Array]:
         return kernel.many_rounds(protocol, world, now, number + jnp.arange(BLOCK, dtype=float), lambda seen: seen.margin)
 
     now, _ = jax.jit(kernel.begin, static_argnames=("protocol",))(protocol, world, first, jax.random.key(0))
@@ -134,7 +135,7 @@ def measure(name: str, count: int) -> Row:
 
 def flow_steps(team: cs.Team, copies: Estimates, nu: Nu, x: jax.Array) -> tuple[float, float]:
     """Seconds an explicit step of the gradient flow over local estimates, from x, and seconds of copying its state."""
-    problem = Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=float(nu.alpha), nu_beta=1.0)))
+    problem = Problem.of(team, copies, SmoothingSchedule.of(cs.Smoothing(nu_alpha=float(nu.alpha), nu_beta=1.0)))
     start = FLOW.start(x + 0.0)
     several = flow_program(problem, start, BLOCK)
     step, copy, _, _ = beside_a_copy(lambda at: several(problem, at), start)
@@ -159,7 +160,7 @@ def small(count: int, seconds: float = 1.0) -> tuple[float, float]:
     """Agent-updates a second of the gradient flow, ẋ = −∇f − (Lx) − z, ż = Lx, every agent estimating all: consat's and NumPy's."""
     team = cs.load("convoy", [f"count={count}"]).team
     copies = Estimates.of(team, "full")
-    problem = Problem.of(team, copies, Schedule.of(cs.Smoothing(nu_alpha=1.0, nu_beta=1.0)))
+    problem = Problem.of(team, copies, SmoothingSchedule.of(cs.Smoothing(nu_alpha=1.0, nu_beta=1.0)))
     steps = 200
     state = FLOW.start(jnp.asarray(np.random.default_rng(0).uniform(1.5, 2.5, (copies.count, 2))))
     many = flow_program(problem, state, steps)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from consat.engine.round import Driven
+from consat.engine.bodies import Driven
 from consat.engine.ways import DETOUR, WAITED, Ways
 from consat.robots import Drive, Planner, Point, box
 

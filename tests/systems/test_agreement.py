@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.engine.round import Body, Seen, World, begin, many_rounds, world_of
+from consat.engine.bodies import Body
+from consat.engine.round import Seen, begin, many_rounds
+from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
-from consat.problem.objective import Schedule
+from consat.problem.objective import SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import automatic, scale
 from consat.protocols import Admm, agreement
@@ -46,7 +48,7 @@ def follow(name: str, rounds: int, layout: str = "local", loss: float = 0.0) -> 
     team = TEAMS[name]
     copies, size = Estimates.of(team, layout), scale(team)  # type: ignore[arg-type]
     first = first_estimates(team, copies, cs.load("case-b").settings.start, size)
-    nu = Schedule.of(automatic(size)).final
+    nu = SmoothingSchedule.of(automatic(size)).final
     world = world_of(team, copies, nu, size, convex=True, faults=Faults(loss, seed=1), body=Body(10, SPEED))
     now, _ = jax.jit(begin, static_argnames=("protocol",), compiler_options=quick_compilation())(
         Admm(), world, jnp.asarray(first), jax.random.key(0)

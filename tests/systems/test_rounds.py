@@ -13,8 +13,8 @@ import pytest
 
 import consat as cs
 from consat.certify.optimum import max_min
-from consat.engine.round import world_of
 from consat.engine.rounds import simulate_rounds
+from consat.engine.world import world_of
 from consat.faults import Faults
 from consat.numerics import float64
 from consat.problem.objective import Nu

@@ -10,7 +10,7 @@ import pytest
 import consat as cs
 from consat.engine.flows import Everyone, Problem
 from consat.numerics import Groups, float64
-from consat.problem.objective import Nu, Objective, Schedule, margin_bounds
+from consat.problem.objective import Nu, Objective, SmoothingSchedule, margin_bounds
 from consat.protocols import GradientFlow
 from consat.protocols.estimates import Estimates
 from consat.settings import Ramp, Smoothing
@@ -36,7 +36,7 @@ def positions(seed: int) -> np.ndarray:
 def gradient(team: cs.Team, x: np.ndarray, nu: Nu) -> np.ndarray:
     """∇f_i of every agent at one formation, (3, 3, 2), through the code that simulations use."""
     copies = Estimates.of(team, "full")
-    schedule = Schedule.of(Smoothing(nu_alpha=float(nu.alpha), nu_beta=float(nu.beta)))
+    schedule = SmoothingSchedule.of(Smoothing(nu_alpha=float(nu.alpha), nu_beta=float(nu.beta)))
     everyone = Everyone(Problem.of(team, copies, schedule), nu)
     return np.asarray(everyone.gradient(jnp.asarray(x)[copies.position])).reshape(3, 3, 2)
 
@@ -134,7 +134,7 @@ def test_families_in_any_order_give_the_constraints_in_the_teams_order() -> None
 
 def test_ramp_ends_where_the_paper_says() -> None:
     with jax.enable_x64(True):
-        schedule = Schedule.of(Smoothing(nu_alpha=5, nu_beta=Ramp(start=0.01, to=5, rate=0.022)))
+        schedule = SmoothingSchedule.of(Smoothing(nu_alpha=5, nu_beta=Ramp(start=0.01, to=5, rate=0.022)))
         assert [float(schedule.at(t).beta) for t in (0.0, 100.0, 300.0)] == pytest.approx([0.01, 2.21, 5.0])
         assert schedule.duration == pytest.approx(4.99 / 0.022)
 

@@ -87,7 +87,7 @@ def test_many_chunks_are_one_chunk(by_pattern: Callable[[], None], monkeypatch: 
 
 
 @float64
-@pytest.mark.parametrize("size", [1, 2, UNROLLED, UNROLLED + 1, LOOPED, LOOPED + 1])
+@pytest.mark.parametrize("size", [1, 2, UNROLLED, UNROLLED + 1, LOOPED, LOOPED + 1, 4 * LOOPED + 1])
 def test_small_systems_are_solved(size: int) -> None:
     random = np.random.default_rng(size)
     factor = random.normal(size=(5, size, size))

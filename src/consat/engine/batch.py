@@ -19,8 +19,9 @@ import numpy as np
 from jax import Array
 
 from consat.engine.chunks import NEVER, Ask, Chosen, Chunk, advance, start
-from consat.engine.round import Now, World
+from consat.engine.round import Now
 from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally, later
+from consat.engine.world import World
 from consat.numerics import float64, on_device, quick_compilation
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates

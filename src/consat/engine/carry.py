@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from consat.engine.round import Driven
+from consat.engine.bodies import Driven
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import Shared

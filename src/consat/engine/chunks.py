@@ -13,8 +13,9 @@ import numpy as np
 from jax import Array
 
 from consat.engine.recording import Choice
-from consat.engine.round import SATISFIED, Now, Seen, Sent, World, begin, one_round, see
+from consat.engine.round import SATISFIED, Now, Seen, Sent, begin, one_round, see
 from consat.engine.violations import violated
+from consat.engine.world import World
 from consat.numerics import on_device, quick_compilation, thorough_compilation
 from consat.protocols import Rounds
 

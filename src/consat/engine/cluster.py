@@ -13,10 +13,12 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from consat.engine.bodies import Body
 from consat.engine.chunks import CHUNK, Chunk, Kept
 from consat.engine.partition import Halo, Share, assign
 from consat.engine.recording import Choice
-from consat.engine.round import Body, Now, Part, Spoken, World, begin, hear, precision_for, speak, world_of
+from consat.engine.round import Now, Spoken, begin, hear, speak
+from consat.engine.world import Part, World, precision_for, world_of
 from consat.errors import InvalidSettings
 from consat.faults import Faults
 from consat.numerics import on_device, quick_compilation

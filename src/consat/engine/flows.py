@@ -18,7 +18,7 @@ from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink
 from consat.engine.violations import shares, violated
 from consat.numerics import float64, on_device, quick_compilation
-from consat.problem.objective import Nu, Objective, Schedule
+from consat.problem.objective import Nu, Objective, SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import scale
 from consat.protocols import Flow, State
@@ -61,11 +61,11 @@ class Problem:
     objective: Objective
     exchange: Exchange
     own: Array
-    schedule: Schedule
+    schedule: SmoothingSchedule
     limit: Array
 
     @classmethod
-    def of(cls, team: Team, estimates: Estimates, schedule: Schedule, limit: float = np.inf) -> Problem:
+    def of(cls, team: Team, estimates: Estimates, schedule: SmoothingSchedule, limit: float = np.inf) -> Problem:
         objective = Objective.of(team, lambda family: estimates.rows(family.owner[:, None], family.agents), estimates.count)
         own = (estimates.holder == estimates.position)[:, None].astype(float)
         return cls(objective, estimates.exchange(), on_device(own), schedule, on_device(limit))
@@ -220,7 +220,7 @@ def simulate_flow(
     team: Team,
     flow: Flow,
     estimates: Estimates,
-    schedule: Schedule,
+    schedule: SmoothingSchedule,
     first: np.ndarray,
     *,
     until: float | None = None,

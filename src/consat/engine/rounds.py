@@ -13,13 +13,15 @@ import numpy as np
 from jax import Array
 
 from consat.engine import Stop
+from consat.engine.bodies import Body
 from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
 from consat.engine.live import Live
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
-from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Body, Now, World, world_of
+from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Now
 from consat.engine.violations import shares
+from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import float64, quick_compilation
 from consat.problem.objective import Nu

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consat.engine.round import Driven
+from consat.engine.bodies import Driven
 from consat.numerics import on_device
 from consat.robots import Drive, Planner, disc
 from consat.robots.obstacles import map_of

@@ -41,7 +41,7 @@ class Nu(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Schedule:
+class SmoothingSchedule:
     """Smoothing over time: ν_α constant, ν_β(t) = min(start + rate·t, to), the paper's ramp (section IV-F). Constant if start = to.
 
     Attributes:
@@ -57,7 +57,7 @@ class Schedule:
     rate: Array
 
     @classmethod
-    def of(cls, smoothing: Smoothing) -> Schedule:
+    def of(cls, smoothing: Smoothing) -> SmoothingSchedule:
         """The schedule of the smoothing in the settings."""
         beta = smoothing.nu_beta
         start, to, rate = (beta.start, beta.to, beta.rate) if isinstance(beta, Ramp) else (beta, beta, 0.0)

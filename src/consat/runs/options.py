@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 import numpy as np
 
 from consat.engine import Stop
+from consat.engine.bodies import Body
 from consat.engine.recording import Who
-from consat.engine.round import Body
 from consat.errors import InvalidSettings
 from consat.faults import Faults
 from consat.problem.team import Team

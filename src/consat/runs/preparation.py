@@ -14,7 +14,7 @@ from consat.certify.certificate import bounds
 from consat.certify.quadratics import shape_of
 from consat.errors import InvalidInput, InvalidSettings, InvalidTeam, counted
 from consat.problem.graphs import loop_length
-from consat.problem.objective import Schedule
+from consat.problem.objective import SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
@@ -153,7 +153,7 @@ class Prepared(NamedTuple):
     team: Team
     copies: Estimates
     then: Estimates | None
-    schedule: Schedule
+    schedule: SmoothingSchedule
     size: Scale
     settings: Settings
 
@@ -161,7 +161,7 @@ class Prepared(NamedTuple):
     def of(cls, team: Team, settings: Settings) -> Prepared:
         """Prepare a team. Raises: InvalidTeam: agents that depend on each other are not connected by links."""
         size = scale(team)
-        schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+        schedule = SmoothingSchedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
         kind, layout = str(settings.protocol.kind), settings.protocol.estimates
         if kind not in PAIRED:
             return cls(team, Estimates.of(team, layout), None, schedule, size, settings)

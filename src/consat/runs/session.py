@@ -17,12 +17,14 @@ from numpy.typing import ArrayLike
 
 from consat.certify.certificate import Verdict, judged
 from consat.certify.reasons import explain
+from consat.engine.bodies import Body
 from consat.engine.carry import Names, carried, robot_placed, robots_carried
 from consat.engine.chunks import CHUNK, Chunk, OneProcess
 from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
-from consat.engine.round import Body, Now, World, world_of
+from consat.engine.round import Now
 from consat.engine.rounds import Tally, driven, known_of
+from consat.engine.world import World, world_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam
 from consat.numerics import float64, on_device
 from consat.problem import structure

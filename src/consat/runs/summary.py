@@ -10,7 +10,7 @@ import numpy as np
 from consat import __version__
 from consat.certify.certificate import bounds
 from consat.numerics import on_device
-from consat.problem.objective import Objective, Schedule, weigh
+from consat.problem.objective import Objective, SmoothingSchedule, weigh
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.results.trace import Trace
@@ -30,7 +30,7 @@ NEARLY = 1e-3
 
 
 def summarise(
-    scenario: Scenario, settings: Settings, schedule: Schedule, size: Scale, trace: Trace, *, full: bool = False,
+    scenario: Scenario, settings: Settings, schedule: SmoothingSchedule, size: Scale, trace: Trace, *, full: bool = False,
     robots: Robots | None = None, since: float = 0.0,
 ) -> dict[str, Any]:  # fmt: skip
     """The document that ``run --json`` prints (schema consat.run/1).

@@ -23,7 +23,7 @@ from consat.network.node.part import Part, split
 from consat.network.node.problem import Alone
 from consat.numerics import float64
 from consat.problem.changes import changed, changes_of
-from consat.problem.objective import Schedule
+from consat.problem.objective import SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import automatic, scale
 from consat.protocols import ROUNDS
@@ -147,7 +147,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         up = crew.ready or time.monotonic()
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
-    schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+    schedule = SmoothingSchedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
     team = crew.stage.there()[0]
     trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
     if crew.done:  # the margins of the trace cover the earlier states; the verdict is about the final team

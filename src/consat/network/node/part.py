@@ -243,7 +243,7 @@ def split(
     """
     from consat.certify.quadratics import shape_of
     from consat.problem.graphs import hops
-    from consat.problem.objective import Schedule
+    from consat.problem.objective import SmoothingSchedule
     from consat.problem.units import automatic, scale
     from consat.protocols.local.interior import Shared, Units
     from consat.runs.preparation import DEFAULT_PROTOCOL, copies_of, default_protocol, first_estimates
@@ -256,7 +256,7 @@ def split(
     if not 1 <= port <= 65536 - team.count:
         raise InvalidSettings(f"port is {port}, but must leave room for {team.count} ports below 65536")
     copies, size = copies_of(team, settings.protocol), scale(team)
-    schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
+    schedule = SmoothingSchedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
     default = default_protocol(team, settings.protocol.estimates)
     named = settings.protocol.kind or (None if default == DEFAULT_PROTOCOL else default)
     common = Settings(

@@ -1,6 +1,7 @@
 """Local part of the interior-point protocol: the Newton step of an agent, its messages, and the bound that it proves.
 
-`layout` defines the variables of an agent and the shared ones, and sorts agents into batches; `step` computes a round.
+`layout` defines the variables of an agent and the shared ones, and sorts agents into batches; `lanes` evaluates their constraints; `state`
+is what an agent keeps, and how it begins; `step` computes a round; `proof` is the bound that the agents prove together.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ from consat.numerics import on_device, pick, taken
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols.estimates import Estimates
-from consat.protocols.local.interior import step
+from consat.protocols.local.interior import state, step
+from consat.protocols.local.interior.lanes import Lanes, Units
 from consat.protocols.local.interior.layout import Batch, Plan, Route, Shared, Way, plan_of, route_of
-from consat.protocols.local.interior.step import Gains, Lanes, Mail, Memory, Proof, Units
+from consat.protocols.local.interior.proof import Proof
+from consat.protocols.local.interior.state import Gains, Memory
+from consat.protocols.local.interior.step import Mail
 
 __all__ = ["Gains", "Interior", "Mail", "Memory", "Proof", "Route", "Shared", "Units", "Way", "route_of"]
 
@@ -87,7 +91,7 @@ class Interior:
 
         def start(batch: Batch) -> Memory:
             y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
-            return _out(step.begin(_lanes(batch, self.units, gains, self.plan.exact), y, gains))
+            return _out(state.begin(_lanes(batch, self.units, gains, self.plan.exact), y, gains))
 
         return self._collected([start(batch) for batch in self.plan.batches])
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import Array
+
+from consat.protocols.local.lanewise import eliminated
 
 LOOPED = 16
 """Largest number of unknowns for elimination by a loop over the pivots; larger systems are split into halves recursively."""
@@ -50,17 +51,7 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
         below, second = solve(matrix[half:, half:] - filled[:, :rest], right[half:] - filled[:, rest:])
         above = found[:, rest:] - product(found[:, :rest], below)
         return jnp.concatenate([above, below]), first & second
-
-    def eliminate(j: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
-        whole, positive = at
-        pivot = whole[j, j]
-        row = whole[j] / pivot[None]
-        factor = jnp.where(jnp.arange(size, dtype=j.dtype)[:, None] == j, 0.0, whole[:, j])
-        return (whole - factor[:, None] * row[None]).at[j].set(row), positive & (pivot > 0)
-
-    start = jnp.concatenate([matrix, right], axis=1), jnp.ones(matrix.shape[-1], bool)
-    whole, positive = jax.lax.fori_loop(0, size, eliminate, start)
-    return whole[:, size:], positive
+    return eliminated(matrix, right)
 
 
 def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Array, Array]:

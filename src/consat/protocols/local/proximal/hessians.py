@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.numerics import add_up
+from consat.protocols.local.lanewise import eliminated
 
 UNROLLED = 8
 """Largest number of unknowns for elimination with unrolled pivots."""
@@ -119,15 +120,14 @@ def solve_symmetric(matrix: Array, right: Array) -> tuple[Array, Array]:
         right: (N, r, A).
 
     Returns:
-        (N, r, A) the solutions, and (A,) whether the matrix is positive definite. For N > 4 · `LOOPED` the latter is not checked and true.
+        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
     """
     size = len(matrix)
     if size > LOOPED:
         first = jnp.moveaxis(matrix, -1, 0)
         found = jnp.moveaxis(jnp.linalg.solve(first, jnp.moveaxis(right, -1, 0)), 0, -1)
-        return found, jnp.linalg.eigvalsh(first)[:, 0] > 0 if size <= 4 * LOOPED else jnp.ones(matrix.shape[-1], bool)
-    whole = jnp.concatenate([matrix, right], axis=1)
-    return _looped(whole, size) if size > UNROLLED else _unrolled(whole, size)
+        return found, jnp.isfinite(jnp.linalg.cholesky(first)).all(axis=(1, 2))  # NaN where there is no factor
+    return eliminated(matrix, right) if size > UNROLLED else _unrolled(jnp.concatenate([matrix, right], axis=1), size)
 
 
 def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
@@ -143,17 +143,3 @@ def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
         if j:
             right = put(right, right[:j] - matrix[:j, j][:, None] * right[j][None], (0, 0, 0))
     return right, positive
-
-
-def _looped(whole: Array, size: int) -> tuple[Array, Array]:
-    """Gauss–Jordan elimination without pivoting, which a positive definite matrix does not need."""
-
-    def eliminate(j: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
-        whole, positive = at
-        pivot = whole[j, j]
-        row = whole[j] / pivot[None]
-        factor = jnp.where(jnp.arange(size)[:, None] == j, 0.0, whole[:, j])
-        return (whole - factor[:, None] * row[None]).at[j].set(row), positive & (pivot > 0)
-
-    whole, positive = jax.lax.fori_loop(0, size, eliminate, (whole, jnp.ones(whole.shape[-1], bool)))
-    return whole[:, size:], positive

@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jax import Array
 from consat.numerics import add_up
 from consat.problem.constraints.domain import HUGE
 from consat.problem.objective import Nu
+from consat.protocols.local.lanewise import along, arguments
 from consat.protocols.local.proximal.batches import Batch, Form, Kind, Matrix
 from consat.protocols.local.proximal.hessians import Alike, Dense
 
@@ -170,15 +171,8 @@ def _arguments(form: Form, kind: Kind, y: Array) -> list[Array]:
     if form.slots is not None:
         return [jnp.stack([y[slot] for slot in slots]) for slots in zip(*form.slots, strict=True)]
     assert kind.slots is not None
-    m, arity, _ = kind.slots.shape
-    flat = kind.slots.reshape(m * arity, 1, -1)
-    found = jnp.take_along_axis(y, flat, axis=0).reshape(m, arity, y.shape[1], -1)
-    return [found[:, k] for k in range(arity)]
-
-
-def _along(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Vectorise a function of one constraint of one agent over the constraints (first axis) and the agents (last axis)."""
-    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1))
+    found = arguments(y, kind.slots)
+    return [found[:, k] for k in range(found.shape[1])]
 
 
 def _masked(kind: Kind, values: Array) -> Array:
@@ -187,13 +181,13 @@ def _masked(kind: Kind, values: Array) -> Array:
 
 
 def _violations(form: Form, kind: Kind, y: Array) -> Array:
-    return _masked(kind, _along(lambda x, p: -form.psi(*x, **p))(_arguments(form, kind, y), kind.parameters))
+    return _masked(kind, along(lambda x, p: -form.psi(*x, **p))(_arguments(form, kind, y), kind.parameters))
 
 
 def _slopes(form: Form, kind: Kind, y: Array) -> tuple[Array, Array]:
     """(m, A) −ψ, −∞ where padded, and (m, arity, d, A) its gradients, 0 where padded."""
     function = jax.value_and_grad(lambda x, p: -form.psi(*x, **p))
-    values, found = _along(function)(_arguments(form, kind, y), kind.parameters)
+    values, found = along(function)(_arguments(form, kind, y), kind.parameters)
     slopes = jnp.stack(found, axis=1)
     if kind.weight is not None:
         slopes = kind.weight[:, None, None] * slopes

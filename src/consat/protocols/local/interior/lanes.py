@@ -1,0 +1,190 @@
+"""ψ of the agents of a batch, its gradient and its curvature. The last axis of every array is the agent (the lane), size A.
+
+Units: positions are relative to the centre of the team's region, in the team's unit of length; ψ is in the team's unit of ψ. So a team in
+millimetres and the same team in kilometres take the same number of rounds. The last constraint of every agent is the cap: the level is at
+most `cap`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from consat.numerics import on_device
+from consat.problem.units import Scale
+from consat.protocols.local.interior.layout import Batch, Kind
+from consat.protocols.local.lanewise import along, arguments
+
+
+class Units(NamedTuple):
+    """Units and region of the team; common knowledge. Scalars have shape ().
+
+    Attributes:
+        center: (d,) centre of the team's region, in the scenario's length.
+        length: the team's unit of length.
+        psi: the team's unit of ψ.
+        reach: half width of the region on each axis, in units of `length`.
+        extent: distance beyond the region to which constraints may lead, in units of `length`.
+    """
+
+    center: Array
+    length: Array
+    psi: Array
+    reach: Array
+    extent: Array
+
+    @classmethod
+    def of(cls, size: Scale) -> Units:
+        """From the natural scale of a team."""
+        return cls(
+            on_device(size.center),
+            on_device(size.length),
+            on_device(size.typical),
+            on_device(size.reach / size.length),
+            on_device(size.extent / size.length),
+        )
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The constraints of the agents of one chunk; m below includes the cap.
+
+    Attributes:
+        batch: static properties of the agents; its arrays are not used.
+        kinds: the constraints, without the axis of chunks.
+        units: see `Units`.
+        cap: upper bound on the level, in units of ψ; None without a cap.
+        shape: (n, d, A).
+        exact: whether bounds can be proven; see `Plan.exact`.
+    """
+
+    batch: Batch
+    kinds: tuple[Kind, ...]
+    units: Units
+    cap: float | None
+    shape: tuple[int, int, int]
+    exact: bool
+
+    @property
+    def quadratic(self) -> Array:
+        """(A,) whether all ψ of an agent are quadratic."""
+        others = [kind.used.any(axis=0) for form, kind in self._each() if not form.quadratic]
+        return ~jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *others]), axis=0)
+
+    @property
+    def used(self) -> Array:
+        """(m, A) false where padded."""
+        own = jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *(kind.used for kind in self.kinds)])
+        return jnp.concatenate([own, own.any(axis=0, keepdims=True) & (self.cap is not None)])
+
+    def psi(self, y: Array) -> Array:
+        """(m, A) ψ at the copies `y`, (n, d, A), the cap last; −∞ outside the domain of ψ, +∞ where padded."""
+        own = [self._masked(kind, along(_at(form.psi))(self._arguments(kind, y), kind.parameters)) for form, kind in self._each()]
+        return self._with_cap(own)
+
+    def slopes(self, y: Array) -> tuple[Array, Array]:
+        """(m, A) ψ and (m, n·d, A) ∇ψ at the copies `y`, (n, d, A); entries of ∇ψ that are not finite are 0."""
+        values, gradients = [], []
+        for form, kind in self._each():
+            value, found = along(jax.value_and_grad(_at(form.psi)))(self._arguments(kind, y), kind.parameters)
+            slope = found * (kind.weight * self.units.length / self.units.psi)[:, None, None]
+            values.append(self._masked(kind, value))
+            gradients.append(self._placed(kind, jnp.where(jnp.isfinite(slope) & kind.used[:, None, None], slope, 0.0)))
+        n, d, count = self.shape
+        return self._with_cap(values), jnp.concatenate([*gradients, jnp.zeros((1, n * d, count))])
+
+    def bends(self, y: Array, quadratic: bool = False) -> tuple[Array, Array, Array]:
+        """Curvature of the constraints as r rank-one terms: Σ w λ v vᵀ is the convex part of −Σ_k λ_k ∇²ψ_k.
+
+        Args:
+            y: (n, d, A) copies.
+            quadratic: whether to include only quadratic ψ, whose curvature is the same everywhere.
+
+        Returns:
+            (r,) the constraint of each term, (r, A) weights w, and (r, n·d, A) vectors v.
+        """
+        n, d, count = self.shape
+        which, weights, vectors, done = [], [jnp.zeros((0, count))], [jnp.zeros((0, n * d, count))], 0
+        for form, kind in self._each():
+            m, arity, _ = kind.slots.shape
+            scale = jnp.where(kind.used, kind.weight * self.units.length**2 / self.units.psi, 0.0)
+            if form.curvature is not None:
+                rank = len(form.curvature)
+                values = jnp.ones((m, rank, count))
+                found = jnp.broadcast_to(jnp.asarray(form.curvature).reshape(rank, arity, d, 1), (m, rank, arity, d, count))
+            elif quadratic and not form.quadratic:
+                rank, values, found = 0, jnp.zeros((m, 0, count)), jnp.zeros((m, 0, arity, d, count))
+            else:
+                rank = arity * d
+                values, found = along(_bend(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)
+            if rank:
+                rows = jnp.repeat(kind.slots, rank, axis=0, total_repeat_length=m * rank)
+                which += [done + k for k in range(m) for _ in range(rank)]
+                weights.append((scale[:, None] * values).reshape(m * rank, count))
+                vectors.append(self._placed(kind._replace(slots=rows), found.reshape(m * rank, arity, d, count)))
+            done += m
+        return jnp.asarray(which, dtype=int), jnp.concatenate(weights), jnp.concatenate(vectors)
+
+    def _each(self) -> Any:
+        return zip(self.batch.forms, self.kinds, strict=True)
+
+    def _with_cap(self, own: list[Array]) -> Array:
+        return jnp.concatenate([*own, jnp.full((1, self.shape[2]), jnp.inf if self.cap is None else self.cap)])
+
+    def _masked(self, kind: Kind, value: Array) -> Array:
+        value = jnp.where(jnp.isfinite(value), kind.weight * value / self.units.psi, -jnp.inf)
+        return jnp.where(kind.used, value, jnp.inf)
+
+    def _arguments(self, kind: Kind, y: Array) -> Array:
+        """(m, arity, d, A) the arguments of each ψ, in the scenario's units."""
+        return arguments(self.units.center[None, :, None] + self.units.length * y, kind.slots)
+
+    def _placed(self, kind: Kind, slope: Array) -> Array:
+        """(m, arity, d, A) → (m, n·d, A): from the arguments of each constraint to the agent's coordinates."""
+        n, d, count = self.shape
+        where = jnp.arange(n, dtype=jnp.int32)[None, None, :, None] == kind.slots[:, :, None]  # (m, arity, n, A)
+        return jnp.sum(jnp.where(where[:, :, :, None], slope[:, :, None], 0.0), axis=1).reshape(len(slope), n * d, count)
+
+
+class Here(NamedTuple):
+    """Values and derivatives of the constraints at the copies.
+
+    Attributes:
+        psi: (m, A) ψ.
+        slopes: (m, n·d, A) ∇ψ.
+        bends: see `Lanes.bends`.
+    """
+
+    psi: Array
+    slopes: Array
+    bends: tuple[Array, Array, Array]
+
+    @classmethod
+    def of(cls, lanes: Lanes, y: Array) -> Here:
+        return cls(*lanes.slopes(y), lanes.bends(y))
+
+
+def _at(psi: Any) -> Any:
+    """ψ as a function of an array of positions, (arity, d), and a dictionary of parameters."""
+    return lambda x, p: psi(*x, **p)
+
+
+def _bend(psi: Any, arity: int, d: int) -> Any:
+    """Function of positions, (arity, d), and parameters that returns the eigenvalues of −∇²ψ, clipped at 0, (R,), and the eigenvectors,
+    (R, arity, d)."""
+
+    def one(x: Array, p: dict[str, Array]) -> tuple[Array, Array]:
+        hessian = -jax.hessian(_at(psi))(x, p).reshape(arity * d, arity * d)
+        values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(hessian).all(), 0.5 * (hessian + hessian.T), 0.0))
+        return jnp.maximum(values, 0.0), vectors.T.reshape(arity * d, arity, d)
+
+    return one
+
+
+def number(mask: Array) -> Array:
+    """(k, A) → (A,) number of true entries."""
+    return jnp.sum(mask.astype(float), axis=0)
