@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import time
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -145,6 +146,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
             crew.start(agent)
         ending = _watch(crew, _rules(parts, plan, size.length), f"{scenario.name}, {plan.mode}", quiet)
         up = crew.ready or time.monotonic()
+        ended = crew.endings(began)
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
@@ -153,8 +155,16 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     if crew.done:  # the margins of the trace cover the earlier states; the verdict is about the final team
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
-    summary = summarise(scenario, settings, schedule, size, trace, full=full) | {"mode": plan.mode, "network": observer.network()}
+    summary = summarise(scenario, settings, schedule, size, trace, full=full)
+    summary |= {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
+    summary["warnings"] += map(_told, ended)
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
+
+
+def _told(ended: Mapping[str, Any]) -> str:
+    """Warning about an agent whose process ended without being told to. `ended`: see `Crew.endings`."""
+    again = "it was started again" if ended["restarted"] else "it was not started again"
+    return f"the process of agent {ended['agent']!r} ended ({ended['how']}) at {ended['time']:.1f} s; {again}"
 
 
 def _settings(team: Team, asked: Settings, mode: Mode) -> Settings:
@@ -215,6 +225,7 @@ class Crew:
         self._scenario, self._script, self._parts = scenario, script, dict(parts)
         self._standby = set(parts) - script.begin.present
         self._generation = 0
+        self._endings: list[dict[str, Any]] = []
         observer.present = script.begin.present
 
     @property
@@ -271,17 +282,46 @@ class Crew:
         self.fleet.start(agent, *own)
 
     def mend(self) -> None:
-        """Restart agents whose process was ended by a signal.
+        """Restart the agents whose process has ended, except those that were told to end.
 
         Raises:
             NetworkError: a process ended with an error. A restart would fail again.
         """
-        for agent in self.observer.team.ids:
-            code = self.fleet.exit_code(agent) or 0
+        for agent, code in self._ended():
             if code > 0:
                 raise NetworkError(f"the process of agent {agent!r} ended with exit code {code}")
-            if code < 0:
-                self.start(agent)
+            self._note(agent, code, restarted=True)
+            self.observer.seen[agent].lose()
+            self.start(agent)
+
+    def endings(self, began: float) -> list[dict[str, Any]]:
+        """Entry ``ended`` of the summary: the processes that ended without being told to, each with its ``agent``, the ``time`` (s since
+        all agents were ready, negative before), ``how`` it ended (a signal or an exit code), and whether it was ``restarted``.
+
+        Args:
+            began: start of the launch on the monotonic clock, s. Times count from it if the agents were never ready.
+        """
+        for agent, code in self._ended():
+            self._note(agent, code, restarted=False)
+        since = began if self.ready is None else self.ready
+        return [{**each, "time": round(each["time"] - since, 3)} for each in self._endings]
+
+    def _ended(self) -> list[tuple[str, int]]:
+        """The agents whose process has ended without being told to, with the exit codes."""
+        ended = []
+        for agent, seen in self.observer.seen.items():
+            told = agent not in self.stage.present and agent not in self._standby
+            done = self.plan.rounds is not None and seen.ended is not None and seen.ended["why"] == "done"
+            code = self.fleet.exit_code(agent)
+            if code is not None and (code > 0 or not (told or done)):
+                ended.append((agent, code))
+        return ended
+
+    def _note(self, agent: str, code: int, *, restarted: bool) -> None:
+        ended = self.observer.seen[agent].ended
+        why = f"exit code {code}" if ended is None or code else ended["why"]
+        how = signal.Signals(-code).name if code < 0 else why
+        self._endings.append({"agent": agent, "time": time.monotonic(), "how": how, "restarted": restarted})
 
     def act(self) -> None:
         """Send the agents the time once all are ready; after that, carry out the commands that are due."""
@@ -320,7 +360,7 @@ class Crew:
         """Whether an agent that is to join stands by. Starts its process if it does not run."""
         if agent not in self._standby and not self.fleet.running(agent):  # it left earlier
             self._standby.add(agent)
-            self.observer.seen[agent].born = None
+            self.observer.seen[agent].lose()
             self.start(agent)
         return agent in self._standby and self.observer.seen[agent].born is not None
 

@@ -81,6 +81,11 @@ class Seen:
             case _:
                 return
 
+    def lose(self) -> None:
+        """Update for the end of its process: what it knew is lost with it."""
+        self.born = self.ended = None
+        self._learn(None, None, settled=False)
+
     def _learn(self, known: Knowledge, stamp: float | None, *, settled: bool) -> None:
         if known != self.known:
             self.known, self.known_from = known, stamp
