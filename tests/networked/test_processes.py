@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import consat as cs
 from consat.network.deploy import output
 from consat.network.deploy.commands import read_commands
 from consat.network.deploy.fleet import Event, Fleet, free_ports
@@ -91,14 +92,10 @@ def test_a_launch_carries_out_timed_commands(tmp_path: Path) -> None:
     assert result["motion"]["duration"] > 1.2
 
 
-def test_launch_gathers_a_result_as_any_run() -> None:
-    done = subprocess.run(
-        [*CONSAT, "launch", "case-c", "--mode", "admm", "--loss", "0.3", "--json"],
-        capture_output=True,
-        text=True,
-        timeout=START,
-        check=False,
-    )
+def test_launch_gathers_a_result_as_any_run(tmp_path: Path) -> None:
+    robots = ["--set", "robots={kind: point, radius: 0.1, speed: 1}"]
+    command = [*CONSAT, "launch", "case-c", *robots, "--mode", "admm", "--loss", "0.3", "--json", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START, check=False)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["schema"] == "consat.run/1"
@@ -108,6 +105,11 @@ def test_launch_gathers_a_result_as_any_run() -> None:
     assert result["network"]["loss"] == pytest.approx(0.3, abs=0.2)
     assert 0 < result["known_from"] == result["network"]["known_from"] < result["time"]
     assert result["satisfied_from"]["time"] <= result["network"]["known_from"] + 0.1  # who knows is right, up to a sample
+    [warning] = result["warnings"]
+    assert "launch simulates each robot as a point" in warning
+    begin = cs.Result.load(result["result"]).data["position"].values[0]
+    start = [part.first[part.team.ids.index(agent)] for agent, part in split(load("case-c")).items()]
+    np.testing.assert_array_equal(begin, start)
 
 
 def test_launch_ends_when_every_agent_knows_that_not_all_can_be_satisfied() -> None:

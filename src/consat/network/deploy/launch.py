@@ -47,6 +47,12 @@ LINK_WINDOW: Final = 10.0
 ROUND_TRIPS: Final = 10.0
 """Number of longest message delays that are added to this time."""
 
+BODILESS: Final = (
+    "launch simulates each robot as a point, without its size and limits, and without obstacles; consat run simulates robots, and "
+    "consat agent --sensor stdin commands real ones"
+)
+"""Warning for a scenario with robots."""
+
 Stop = Literal["satisfied", "converged", "never"]
 """Condition for the end of a launch: all agents know the outcome, the team has converged, or none."""
 
@@ -157,7 +163,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full=full)
     summary |= {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
-    summary["warnings"] += map(_told, ended)
+    summary["warnings"] += [*map(_told, ended), *([] if scenario.robots is None else [BODILESS])]
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 

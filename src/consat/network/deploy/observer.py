@@ -190,7 +190,7 @@ class Observer:
     def trace(
         self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], tick: float
     ) -> Trace:  # fmt: skip
-        """The trace of the agents that are present at the end. A position holds until the next stamp.
+        """The trace of the agents that are present at the end. It begins at the start positions; a position holds until the next stamp.
 
         Args:
             copies: the estimates at the end: holders and positions held.
@@ -208,6 +208,8 @@ class Observer:
             stamps = np.append(np.arange(begin, end, SAMPLE), end)
             steps = stamps - begin
         position = np.stack([self._along(seen, row, stamps) for seen, row in zip(self.seen.values(), self._start, strict=True)], axis=1)
+        if len(stamps) > 1:
+            position[0] = self._start  # the first stamp is that of a step, after which the body may be elsewhere
         dt = tick if self.clock == "round" else SAMPLE
         times = steps * (tick if self.clock == "round" else 1.0)
         margins, smooth = _seen(stages, position, times, nu)
