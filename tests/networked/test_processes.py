@@ -140,6 +140,30 @@ def test_agents_end_by_themselves_when_they_know_all_that_there_is_to_find() -> 
         assert -0.0814394461 <= told["bound"] < 0 and told["margin"] == pytest.approx(-0.0814394, rel=0.06)  # noqa: PT018
 
 
+RING = """
+consat: 1
+name: ring
+agents:
+  - {id: a, constraints: [{kind: within, center: [0, 0], radius: 0.5}]}
+  - {id: b, constraints: [{kind: near, agent: a, radius: 0.5}]}
+  - {id: c, constraints: [{kind: near, agent: b, radius: 0.5}, {kind: within, center: [4, 0], radius: 0.5}]}
+  - {id: d, constraints: [{kind: near, agent: c, radius: 0.5}, {kind: near, agent: a, radius: 0.5}]}
+communication: {graph: ring}
+"""
+
+
+def test_a_torn_team_whose_links_form_a_loop_goes_over_to_a_tree_and_proves_that_it_is(tmp_path: Path) -> None:
+    """Along its loop nobody can prove it, and the launch would end undecided."""
+    (tmp_path / "ring.yaml").write_text(RING)
+    command = [*CONSAT, "launch", str(tmp_path / "ring.yaml"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START, check=False)
+    assert done.returncode == 4, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["status"], result["known"], result["ending"]) == ("least-violating", "infeasible", "settled")
+    assert (result["route"], result["network"]["ended"]) == ("tree", [])
+    assert result["margin"] == pytest.approx(-0.75, rel=0.05)  # two discs and two links share a distance of 4: 0.5² − 1²
+
+
 @pytest.fixture(scope="module")
 def truth() -> dict[str, np.ndarray]:
     """(T, d) of each agent, as `simulate` has it when every product is rounded by itself."""

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from consat.engine.rounds import HOLD, SETTLED
+from consat.engine.rounds import HOLD, SETTLED, TURN, TURN_HOP
 from consat.errors import NetworkError
 from consat.faults import Faults
 from consat.network.deploy.commands import Script, Stage, Timed, load_commands, no_commands
@@ -33,7 +33,7 @@ from consat.results.result import Result
 from consat.results.trace import Ending
 from consat.runs.options import RATE as ROUNDS_A_SECOND
 from consat.runs.options import WATCHED
-from consat.runs.preparation import copies_of, default_protocol
+from consat.runs.preparation import copies_of, default_protocol, told, way_of
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, dump
 from consat.settings import Settings
@@ -157,12 +157,14 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
     team = crew.stage.there()[0]
-    trace = observer.trace(copies_of(team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
+    trace = observer.trace(copies_of(crew.tree or team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
     if crew.done:  # the margins of the trace cover the earlier states; the verdict is about the final team
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full=full)
-    summary |= {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
+    summary |= told(team, settings.protocol) | {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
+    if crew.tree is not None:
+        summary |= {"route": "tree", "why": "the links form loops and had not satisfied the team in time; it went over to a spanning tree"}
     summary["warnings"] += [*map(_told, ended), *([] if scenario.robots is None else [BODILESS])]
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
@@ -218,6 +220,7 @@ class Crew:
     Attributes:
         stages: states of the team so far, in order of time.
         epoch: Unix time of t = 0, s; None until all agents are ready.
+        tree: the present agents with the links of a spanning tree, along which they exchange copies; None while they do so along all links.
         ready: the same time on the monotonic clock of this machine, s.
     """
 
@@ -231,6 +234,9 @@ class Crew:
         self._scenario, self._script, self._parts = scenario, script, dict(parts)
         self._standby = set(parts) - script.begin.present
         self._generation = 0
+        self.tree: Team | None = None
+        self._changed = -np.inf  # stamp of the last change of the team by a command or a restart
+        self._turned: float | None = None  # stamp at which `turn` has decided on a tree; None before
         self._endings: list[dict[str, Any]] = []
         observer.present = script.begin.present
 
@@ -299,6 +305,7 @@ class Crew:
             self._note(agent, code, restarted=True)
             self.observer.seen[agent].lose()
             self.start(agent)
+            self._changed = time.monotonic()
 
     def endings(self, began: float) -> list[dict[str, Any]]:
         """Entry ``ended`` of the summary: the processes that ended without being told to, each with its ``agent``, the ``time`` (s since
@@ -347,6 +354,7 @@ class Crew:
     def _carry_out(self, command: Timed) -> bool:
         """Carry out a command. Returns False if it must wait, because the agent that is to join is not ready."""
         agent = command.agents[0]
+        self._changed = time.monotonic()
         if command.command == "change":
             part = self._parts[agent]
             team = changed(part.team, changes_of(part.team, agent, command.constraint, command.parameters))
@@ -356,6 +364,7 @@ class Crew:
             return True
         if command.command == "join" and not self._is_ready(agent):
             return False
+        self.tree = self._turned = None
         self._split_anew(command.after.there()[0])
         if command.command in ("leave", "join"):
             self._standby -= {agent}
@@ -369,6 +378,52 @@ class Crew:
             self.observer.seen[agent].lose()
             self.start(agent)
         return agent in self._standby and self.observer.seen[agent].born is not None
+
+    def turn(self) -> None:
+        """Split the team along a spanning tree if it is not satisfied in time along links with loops.
+
+        On the tree the agents can prove that they cannot be satisfied. `consat.run` does the same after as many rounds, see
+        `consat.engine.rounds.TURN`. Here the agents take their turns at rates of their own, messages are lost or late, and a new split costs
+        seconds; so the team has at least `WINDOW`, and more turns where messages take longer.
+        """
+        if self._turned is not None or not self._overdue():
+            return
+        self._turned = time.monotonic()
+        team, protocol = self.stage.there()[0], self._scenario.settings.protocol
+        then = way_of(team, str(protocol.kind), protocol.estimates).then
+        if then is not None:
+            self.tree = team.with_links(then.links)
+            self._split_anew(self.tree)
+
+    @property
+    def still_from(self) -> float:
+        """The stamp from which standing still counts as convergence: not before `turn` has decided, and the agents follow the tree."""
+        if self.tree is not None and self._turned is not None:
+            born = [seen.born for seen in self.observer.there]
+            return max((np.inf if each is None or each < self._turned else each for each in born), default=-np.inf)
+        return np.inf if self._turned is None and self._may_turn and self._unsatisfied() else -np.inf
+
+    @property
+    def _may_turn(self) -> bool:
+        return self.plan.mode == "interior-point" and not self.stage.team.moves
+
+    def _unsatisfied(self) -> bool:
+        """Whether an agent has reported a margin that is not positive; at the estimates where bodies are slow and long on their way."""
+        kind = "margin" if self.plan.speed is None else "estimate_margin"
+        margins = [seen.report[kind] for seen in self.observer.there if seen.report is not None]
+        return any(margin is not None and margin <= 0 for margin in margins)
+
+    def _overdue(self) -> bool:
+        """Whether the team has taken enough turns since its last change, and is still not satisfied."""
+        plan, there = self.plan, self.observer.there
+        if not (self._may_turn and self._unsatisfied() and all(seen.stamps for seen in there)):
+            return False
+        first = max(self._changed, min(seen.stamps[0] for seen in there))
+        if min(seen.stamps[-1] for seen in there) < first + WINDOW:
+            return False
+        hops, rate = max(part.hops for part in self._parts.values()), plan.rate or RATE[plan.mode]
+        turns = (TURN + TURN_HOP * hops) * (1.0 + plan.delay[1] * rate) / (1.0 - plan.loss)
+        return bool(min(len(seen.stamps) - np.searchsorted(seen.stamps, first) for seen in there) >= turns)
 
     def _split_anew(self, team: Team) -> None:
         """Send new parts to the agents of `team`, because the holders of estimates and the paths of messages may have changed."""
@@ -401,6 +456,7 @@ def _watch(crew: Crew, rules: _Rules, title: str, quiet: bool) -> Ending:
                 draw(observer, {agent: crew.fleet.running(agent) for agent in agents}, time.monotonic() - began)
                 crew.mend()
                 crew.act()
+                crew.turn()
                 if not np.isfinite(observer.positions()).all():
                     return "diverged"
                 if plan.rounds is not None and all(seen.finished or seen.ended for seen in observer.there):
@@ -409,19 +465,21 @@ def _watch(crew: Crew, rules: _Rules, title: str, quiet: bool) -> Ending:
                     continue
                 if end is None:
                     end = time.monotonic() + (plan.until or 0.0)
-                if (found := _ending(observer, plan.ending, rules, crew.earliest)) is not None:
+                if (found := _ending(crew, rules)) is not None:
                     return found
     except KeyboardInterrupt:
         return "interrupted"
     return "out of time"
 
 
-def _ending(observer: Observer, stop: Stop, rules: _Rules, earliest: float) -> Ending | None:
+def _ending(crew: Crew, rules: _Rules) -> Ending | None:
+    observer, stop, earliest = crew.observer, crew.plan.ending, crew.earliest
+    if stop == "never":
+        return None
     latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in observer.there)
     known, since = observer.all_known()[0], observer.concluded()
     since = None if since is None else max(since, earliest)
-    if stop != "never" and (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
+    if (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
         return "satisfied" if known == "satisfied" else "settled"
-    if stop != "never" and latest >= max(rules.earliest, earliest) and observer.settled(rules.window, rules.distance):
-        return "settled"
-    return None
+    rests = latest >= max(rules.earliest, earliest, crew.still_from + rules.window) and observer.settled(rules.window, rules.distance)
+    return "settled" if rests else None

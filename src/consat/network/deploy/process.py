@@ -234,9 +234,11 @@ def _obey(runner: Runner, own: _Own) -> Anew | None:
 
 
 def _carried(station: Station, part: Part, core: Embodied) -> Anew:
-    """The state after a reload, starting from the current estimates."""
+    """The state after a reload, starting from the current estimates. New copies start at the agent's estimate of its own position, as in
+    `consat.protocols.estimates.Estimates.carried`."""
     known = station.estimates
-    first = [known.get(agent, row) for agent, row in zip(part.team.ids, part.first, strict=True)]
+    own = known.get(part.me)
+    first = [known.get(agent, row if own is None else own) for agent, row in zip(part.team.ids, part.first, strict=True)]
     return Anew(replace(part, first=np.array(first), epoch=station.epoch if part.epoch is None else part.epoch), core, station.membership)
 
 
