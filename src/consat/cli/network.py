@@ -240,6 +240,7 @@ def launch(
     """
     prepare_own(exact=False)
     from consat.engine.files import claim
+    from consat.faults import Faults
     from consat.network.deploy.launch import Plan
     from consat.network.deploy.launch import launch as launch_team
     from consat.network.node.modes import mode_for
@@ -249,6 +250,7 @@ def launch(
 
     loaded = _with(load(scenario, overrides), protocol, estimates, seed)
     asked = loaded.settings.protocol
+    plan["faults"] = Faults(plan.pop("loss"), burst=plan.pop("burst"), delay=plan.pop("delay"))
     plan["mode"] = plan["mode"] or mode_for(asked.kind or default_protocol(loaded.team, asked.estimates))
     if out is not None:
         claim(out, loaded.name, force=force)

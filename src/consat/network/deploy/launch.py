@@ -6,7 +6,7 @@ import signal
 import time
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -66,9 +66,7 @@ class Plan:
         rate: turns per second, Hz; None for the default of the mode.
         pace: in mode link, protocol time per real time, s/s.
         speed: largest speed of a body, length/s; None for no limit.
-        loss: probability that an incoming message is dropped.
-        burst: (p, q) of losses in bursts, see `consat.faults.Faults`; None for no bursts.
-        delay: (low, high) range of the random delay of incoming messages, s.
+        faults: loss, bursts and delay of incoming messages. Each agent draws from a seed of its own, derived from that of the scenario.
         rounds: number of turns; None for no limit.
         until: duration, s, counted from the time when all agents have begun; None for no limit.
         stop: condition for an earlier end; None for the default in `ending`.
@@ -81,9 +79,7 @@ class Plan:
     rate: float | None = None
     pace: float = 1.0
     speed: float | None = None
-    loss: float = 0.0
-    burst: tuple[float, float] | None = None
-    delay: tuple[float, float] = (0.0, 0.0)
+    faults: Faults = field(default_factory=Faults)
     rounds: int | None = None
     until: float | None = None
     stop: Stop | None = None
@@ -93,7 +89,6 @@ class Plan:
 
     def __post_init__(self) -> None:
         Manner(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if options are not valid
-        Faults(self.loss, burst=self.burst, delay=self.delay)
 
     @property
     def ending(self) -> Stop:
@@ -108,11 +103,12 @@ class Plan:
 
     def options(self) -> list[str]:
         """The corresponding command line options of ``consat agent``."""
+        faults = self.faults
         given = {
             "--mode": self.mode, "--rate": self.rate, "--speed": self.speed, "--rounds": self.rounds,
-            "--pace": self.pace if self.pace != 1.0 else None, "--loss": self.loss or None,
-            "--burst": None if self.burst is None else f"{self.burst[0]},{self.burst[1]}",
-            "--delay": f"{self.delay[0]},{self.delay[1]}" if self.delay[1] else None, "--keys": self.keys,
+            "--pace": self.pace if self.pace != 1.0 else None, "--loss": faults.loss or None,
+            "--burst": None if faults.burst is None else f"{faults.burst[0]},{faults.burst[1]}",
+            "--delay": f"{faults.delay[0]},{faults.delay[1]}" if faults.delay[1] else None, "--keys": self.keys,
             "--sends": None if self.sends == "all" else self.sends,
         }  # fmt: skip
         return [text for name, value in given.items() if value is not None for text in (name, str(value))]
@@ -203,7 +199,7 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
         earliest = protocol.earliest(Alone.of(part, protocol.speaks))
         return _Rules(HOLD, SETTLED * length, earliest + HOLD)
     window = max(WINDOW, LINK_WINDOW / plan.pace if plan.mode == "link" else 0.0, HOLD / (plan.rate or RATE[plan.mode]))
-    return _Rules(window + ROUND_TRIPS * plan.delay[1], SETTLED * length, -np.inf)
+    return _Rules(window + ROUND_TRIPS * plan.faults.delay[1], SETTLED * length, -np.inf)
 
 
 class Crew:
@@ -382,9 +378,9 @@ class Crew:
     def turn(self) -> None:
         """Split the team along a spanning tree if it is not satisfied in time along links with loops.
 
-        On the tree the agents can prove that they cannot be satisfied. `consat.run` does the same after as many rounds, see
-        `consat.engine.rounds.TURN`. Here the agents take their turns at rates of their own, messages are lost or late, and a new split costs
-        seconds; so the team has at least `WINDOW`, and more turns where messages take longer.
+        On the tree the agents can prove that they cannot be satisfied. `consat.run` does the same after the same number of rounds, see
+        `consat.engine.rounds.TURN`. Here a new split costs seconds, so the team has at least `WINDOW`. Where messages are lost or late, it
+        has proportionally more turns.
         """
         if self._turned is not None or not self._overdue():
             return
@@ -422,7 +418,7 @@ class Crew:
         if min(seen.stamps[-1] for seen in there) < first + WINDOW:
             return False
         hops, rate = max(part.hops for part in self._parts.values()), plan.rate or RATE[plan.mode]
-        turns = (TURN + TURN_HOP * hops) * (1.0 + plan.delay[1] * rate) / (1.0 - plan.loss)
+        turns = (TURN + TURN_HOP * hops) * (1.0 + plan.faults.delay[1] * rate) / (1.0 - plan.faults.loss)
         return bool(min(len(seen.stamps) - np.searchsorted(seen.stamps, first) for seen in there) >= turns)
 
     def _split_anew(self, team: Team) -> None:
