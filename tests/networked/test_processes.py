@@ -20,7 +20,7 @@ import consat as cs
 from consat.network.deploy import output
 from consat.network.deploy.commands import read_commands
 from consat.network.deploy.fleet import Event, Fleet, free_ports
-from consat.network.deploy.launch import Crew, Plan
+from consat.network.deploy.launch import Plan, Supervisor
 from consat.network.deploy.observer import Observer
 from consat.network.node.part import Part, split
 from consat.scenario import load
@@ -278,30 +278,30 @@ def test_who_ends_without_being_told_to_is_started_again_and_knows_what_it_knew(
     script = read_commands("- {at: 0, agent: a3, command: leave}", "commands", team, "interior-point")
     observer = Observer(team, np.array([those[agent].first[those[agent].team.ids.index(agent)] for agent in GOAL]), "time")
     with Fleet(those) as fleet:
-        crew = Crew(fleet, observer, Plan(), scenario, script, those)
+        supervisor = Supervisor(fleet, observer, Plan(), scenario, script, those)
 
         def go_on(until: Callable[[], bool]) -> None:
             end = time.monotonic() + START
             while not until():
-                assert time.monotonic() < end, crew.endings(0.0)
+                assert time.monotonic() < end, supervisor.endings(0.0)
                 observer.take(fleet.poll(0.05))
-                crew.mend()
-                crew.act()
+                supervisor.mend()
+                supervisor.act()
 
         def known() -> bool:
-            return crew.done == 1 and observer.all_known()[0] == "satisfied" and observer.seen["a3"].ended is not None
+            return supervisor.done == 1 and observer.all_known()[0] == "satisfied" and observer.records["a3"].ended is not None
 
         for agent in GOAL:
-            crew.start(agent)
+            supervisor.start(agent)
         go_on(known)
         for number, (agent, how) in enumerate((("a2", signal.SIGTERM), ("a1", signal.SIGKILL)), 1):
             os.kill(fleet.pid(agent), how)
-            go_on(lambda number=number: len(crew.endings(0.0)) == number)  # type: ignore[misc]
+            go_on(lambda number=number: len(supervisor.endings(0.0)) == number)  # type: ignore[misc]
             assert not known()
             go_on(known)
         os.kill(fleet.pid("a1"), signal.SIGTERM)
         listen(fleet, [], lambda: fleet.exit_code("a1") is not None, START)
-        told = [(each["agent"], each["how"], each["restarted"]) for each in crew.endings(0.0)]
+        told = [(each["agent"], each["how"], each["restarted"]) for each in supervisor.endings(0.0)]
         assert told == [("a2", "SIGTERM", True), ("a1", "SIGKILL", True), ("a1", "exit code 0", False)]
 
 

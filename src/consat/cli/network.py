@@ -183,12 +183,12 @@ def agent(
     prepare_own(exact=mode == "lockstep")
     from consat.faults import Faults
     from consat.network.deploy.process import ProcessOptions, run_agent
-    from consat.network.node.modes import Manner, mode_for
+    from consat.network.node.modes import NodeSettings, mode_for
     from consat.network.node.part import is_part, load_text, read_part
 
     speed = options.pop("speed")
     part = _part(scenario, agent, overrides, port, mode)
-    manner = Manner(
+    node = NodeSettings(
         mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report, sends
     )
     if options["robot"] is not None and options["sensor"] != "stdin":
@@ -200,7 +200,7 @@ def agent(
     again = (lambda: read_part(load_text(file), scenario)) if file.is_file() and is_part(load_text(file), scenario) else None
     faults = Faults(options.pop("loss"), seed=options.pop("seed"), burst=options.pop("burst"), delay=options.pop("delay"))
     options |= {"faults": faults, "speed": math.inf if speed is None else speed, "keys": _keys(keys, scenario, [agent])}
-    run_agent(part, manner, ProcessOptions(**options), again)
+    run_agent(part, node, ProcessOptions(**options), again)
     return DONE
 
 

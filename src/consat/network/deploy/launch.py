@@ -19,9 +19,9 @@ from consat.network.deploy.commands import Script, Stage, Timed, load_commands, 
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
 from consat.network.deploy.observer import Observer
-from consat.network.node.modes import DEFAULT_MODE, RATE, Manner, Mode, protocol_of
+from consat.network.node.modes import DEFAULT_MODE, RATE, Mode, NodeSettings, protocol_of
 from consat.network.node.part import Part, split
-from consat.network.node.problem import Alone
+from consat.network.node.problem import OwnSolver
 from consat.numerics import float64
 from consat.problem.changes import changed, changes_of
 from consat.problem.objective import Schedule
@@ -88,7 +88,7 @@ class Plan:
     sends: Sends = "all"
 
     def __post_init__(self) -> None:
-        Manner(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if options are not valid
+        NodeSettings(self.mode, self.rate, self.pace, sends=self.sends)  # raises once, before any agent starts, if options are not valid
 
     @property
     def ending(self) -> Stop:
@@ -143,30 +143,32 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     observer = Observer(team, starts, "round" if plan.mode == "lockstep" else "time")
     began = time.monotonic()
     with Fleet(parts, plan.options(), exact=plan.mode == "lockstep") as fleet:
-        crew = Crew(fleet, observer, plan, scenario, script, parts)
+        supervisor = Supervisor(fleet, observer, plan, scenario, script, parts)
         for agent in team.ids:
-            crew.start(agent)
-        ending = _watch(crew, _rules(parts, plan, size.length), f"{scenario.name}, {plan.mode}", quiet)
-        up = crew.ready or time.monotonic()
-        ended = crew.endings(began)
+            supervisor.start(agent)
+        ending = _watch(supervisor, _rules(parts, plan, size.length), f"{scenario.name}, {plan.mode}", quiet)
+        up = supervisor.ready or time.monotonic()
+        ended = supervisor.endings(began)
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    team = crew.stage.there()[0]
-    trace = observer.trace(copies_of(crew.tree or team, settings.protocol), schedule.final, ending, seconds, crew.stages, crew.tick)
-    if crew.done:  # the margins of the trace cover the earlier states; the verdict is about the final team
+    team = supervisor.stage.there()[0]
+    trace = observer.trace(
+        copies_of(supervisor.tree or team, settings.protocol), schedule.final, ending, seconds, supervisor.stages, supervisor.tick
+    )
+    if supervisor.done:  # the margins of the trace cover the earlier states; the verdict is about the final team
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full=full)
     summary |= told(team, settings.protocol) | {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
-    if crew.tree is not None:
+    if supervisor.tree is not None:
         summary |= {"route": "tree", "why": "the links form loops and had not satisfied the team in time; it went over to a spanning tree"}
     summary["warnings"] += [*map(_told, ended), *([] if scenario.robots is None else [BODILESS])]
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
 def _told(ended: Mapping[str, Any]) -> str:
-    """Warning about an agent whose process ended without being told to. `ended`: see `Crew.endings`."""
+    """Warning about an agent whose process ended without being told to. `ended`: see `Supervisor.endings`."""
     again = "it was started again" if ended["restarted"] else "it was not started again"
     return f"the process of agent {ended['agent']!r} ended ({ended['how']}) at {ended['time']:.1f} s; {again}"
 
@@ -196,13 +198,13 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
     if plan.mode == "lockstep":
         part = next(iter(parts.values()))
         protocol = ROUNDS[protocol_of(plan.mode, part.settings.protocol.kind)]()
-        earliest = protocol.earliest(Alone.of(part, protocol.speaks))
+        earliest = protocol.earliest(OwnSolver.of(part, protocol.speaks))
         return _Rules(HOLD, SETTLED * length, earliest + HOLD)
     window = max(WINDOW, LINK_WINDOW / plan.pace if plan.mode == "link" else 0.0, HOLD / (plan.rate or RATE[plan.mode]))
     return _Rules(window + ROUND_TRIPS * plan.faults.delay[1], SETTLED * length, -np.inf)
 
 
-class Crew:
+class Supervisor:
     """Controls the agents of a launch: starts them, restarts them after a crash, sends them the time and the commands.
 
     Args:
@@ -276,11 +278,11 @@ class Crew:
         return np.inf if self.epoch is None else self._stamp(self.epoch) + last
 
     def start(self, agent: str) -> None:
-        """Start or restart an agent, with its body where it was last seen. In lockstep it resumes from its state on disk."""
+        """Start or restart an agent, with its body where it was last record. In lockstep it resumes from its state on disk."""
         ids, seed = list(self.observer.team.ids), self._scenario.settings.start.seed
         own = ["--seed", str(seed * len(ids) + ids.index(agent))]
-        if self.observer.seen[agent].places:
-            own += ["--position", ",".join(map(repr, self.observer.seen[agent].places[-1]))]
+        if self.observer.records[agent].places:
+            own += ["--position", ",".join(map(repr, self.observer.records[agent].places[-1]))]
         if self.plan.mode == "lockstep":
             own += ["--memory", str(self.fleet.file(agent, "state"))]
         if self.epoch is not None:
@@ -299,7 +301,7 @@ class Crew:
             if code > 0:
                 raise NetworkError(f"the process of agent {agent!r} ended with exit code {code}")
             self._note(agent, code, restarted=True)
-            self.observer.seen[agent].lose()
+            self.observer.records[agent].lose()
             self.start(agent)
             self._changed = time.monotonic()
 
@@ -318,16 +320,16 @@ class Crew:
     def _ended(self) -> list[tuple[str, int]]:
         """The agents whose process has ended without being told to, with the exit codes."""
         ended = []
-        for agent, seen in self.observer.seen.items():
+        for agent, record in self.observer.records.items():
             told = agent not in self.stage.present and agent not in self._standby
-            done = self.plan.rounds is not None and seen.ended is not None and seen.ended["why"] == "done"
+            done = self.plan.rounds is not None and record.ended is not None and record.ended["why"] == "done"
             code = self.fleet.exit_code(agent)
             if code is not None and (code > 0 or not (told or done)):
                 ended.append((agent, code))
         return ended
 
     def _note(self, agent: str, code: int, *, restarted: bool) -> None:
-        ended = self.observer.seen[agent].ended
+        ended = self.observer.records[agent].ended
         why = f"exit code {code}" if ended is None or code else ended["why"]
         how = signal.Signals(-code).name if code < 0 else why
         self._endings.append({"agent": agent, "time": time.monotonic(), "how": how, "restarted": restarted})
@@ -335,7 +337,7 @@ class Crew:
     def act(self) -> None:
         """Send the agents the time once all are ready; after that, carry out the commands that are due."""
         if self.epoch is None:
-            if not all(seen.born is not None for seen in self.observer.seen.values()):
+            if not all(record.born is not None for record in self.observer.records.values()):
                 return
             self.epoch, self.ready = time.time(), time.monotonic()
             if self.timed and self.plan.mode != "lockstep":
@@ -361,7 +363,7 @@ class Crew:
         if command.command == "join" and not self._is_ready(agent):
             return False
         self.tree = self._turned = None
-        self._split_anew(command.after.there()[0])
+        self._split_again(command.after.there()[0])
         if command.command in ("leave", "join"):
             self._standby -= {agent}
             self.fleet.tell(agent, {"command": command.command})
@@ -371,9 +373,9 @@ class Crew:
         """Whether an agent that is to join stands by. Starts its process if it does not run."""
         if agent not in self._standby and not self.fleet.running(agent):  # it left earlier
             self._standby.add(agent)
-            self.observer.seen[agent].lose()
+            self.observer.records[agent].lose()
             self.start(agent)
-        return agent in self._standby and self.observer.seen[agent].born is not None
+        return agent in self._standby and self.observer.records[agent].born is not None
 
     def turn(self) -> None:
         """Split the team along a spanning tree if it is not satisfied in time along links with loops.
@@ -389,13 +391,13 @@ class Crew:
         then = way_of(team, str(protocol.kind), protocol.estimates).then
         if then is not None:
             self.tree = team.with_links(then.links)
-            self._split_anew(self.tree)
+            self._split_again(self.tree)
 
     @property
     def still_from(self) -> float:
         """The stamp from which standing still counts as convergence: not before `turn` has decided, and the agents follow the tree."""
         if self.tree is not None and self._turned is not None:
-            born = [seen.born for seen in self.observer.there]
+            born = [record.born for record in self.observer.there]
             return max((np.inf if each is None or each < self._turned else each for each in born), default=-np.inf)
         return np.inf if self._turned is None and self._may_turn and self._unsatisfied() else -np.inf
 
@@ -406,22 +408,22 @@ class Crew:
     def _unsatisfied(self) -> bool:
         """Whether an agent has reported a margin that is not positive; at the estimates where bodies are slow and long on their way."""
         kind = "margin" if self.plan.speed is None else "estimate_margin"
-        margins = [seen.report[kind] for seen in self.observer.there if seen.report is not None]
+        margins = [record.report[kind] for record in self.observer.there if record.report is not None]
         return any(margin is not None and margin <= 0 for margin in margins)
 
     def _overdue(self) -> bool:
         """Whether the team has taken enough turns since its last change, and is still not satisfied."""
         plan, there = self.plan, self.observer.there
-        if not (self._may_turn and self._unsatisfied() and all(seen.stamps for seen in there)):
+        if not (self._may_turn and self._unsatisfied() and all(record.stamps for record in there)):
             return False
-        first = max(self._changed, min(seen.stamps[0] for seen in there))
-        if min(seen.stamps[-1] for seen in there) < first + WINDOW:
+        first = max(self._changed, min(record.stamps[0] for record in there))
+        if min(record.stamps[-1] for record in there) < first + WINDOW:
             return False
         hops, rate = max(part.hops for part in self._parts.values()), plan.rate or RATE[plan.mode]
         turns = (TURN + TURN_HOP * hops) * (1.0 + plan.faults.delay[1] * rate) / (1.0 - plan.faults.loss)
-        return bool(min(len(seen.stamps) - np.searchsorted(seen.stamps, first) for seen in there) >= turns)
+        return bool(min(len(record.stamps) - np.searchsorted(record.stamps, first) for record in there) >= turns)
 
-    def _split_anew(self, team: Team) -> None:
+    def _split_again(self, team: Team) -> None:
         """Send new parts to the agents of `team`, because the holders of estimates and the paths of messages may have changed."""
         self._generation += 1
         addresses = {agent: self._parts[agent].listen for agent in team.ids}
@@ -433,49 +435,49 @@ class Crew:
             self.fleet.tell(agent, {"command": "reload"})
 
 
-def _watch(crew: Crew, rules: _Rules, title: str, quiet: bool) -> Ending:
+def _watch(supervisor: Supervisor, rules: _Rules, title: str, quiet: bool) -> Ending:
     """Watch the team until it must be stopped. Returns why it ended. Restarts agents that crash.
 
     Args:
-        crew: the agents.
+        supervisor: the agents.
         rules: criterion for convergence.
         title: title of the table in the terminal.
         quiet: whether to show no table.
     """
-    began, plan, observer = time.monotonic(), crew.plan, crew.observer
+    began, plan, observer = time.monotonic(), supervisor.plan, supervisor.observer
     end = None if plan.until is not None else began + PATIENCE
     agents = observer.team.ids
     try:
         with board(title, quiet=quiet) as draw:
             while end is None or time.monotonic() < end:
-                observer.take(crew.fleet.poll(0.05))
-                draw(observer, {agent: crew.fleet.running(agent) for agent in agents}, time.monotonic() - began)
-                crew.mend()
-                crew.act()
-                crew.turn()
+                observer.take(supervisor.fleet.poll(0.05))
+                draw(observer, {agent: supervisor.fleet.running(agent) for agent in agents}, time.monotonic() - began)
+                supervisor.mend()
+                supervisor.act()
+                supervisor.turn()
                 if not np.isfinite(observer.positions()).all():
                     return "diverged"
-                if plan.rounds is not None and all(seen.finished or seen.ended for seen in observer.there):
+                if plan.rounds is not None and all(record.finished or record.ended for record in observer.there):
                     return "out of time"
-                if not all(seen.stamps for seen in observer.there):
+                if not all(record.stamps for record in observer.there):
                     continue
                 if end is None:
                     end = time.monotonic() + (plan.until or 0.0)
-                if (found := _ending(crew, rules)) is not None:
+                if (found := _ending(supervisor, rules)) is not None:
                     return found
     except KeyboardInterrupt:
         return "interrupted"
     return "out of time"
 
 
-def _ending(crew: Crew, rules: _Rules) -> Ending | None:
-    observer, stop, earliest = crew.observer, crew.plan.ending, crew.earliest
+def _ending(supervisor: Supervisor, rules: _Rules) -> Ending | None:
+    observer, stop, earliest = supervisor.observer, supervisor.plan.ending, supervisor.earliest
     if stop == "never":
         return None
-    latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in observer.there)
+    latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in observer.there)
     known, since = observer.all_known()[0], observer.concluded()
     since = None if since is None else max(since, earliest)
     if (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
         return "satisfied" if known == "satisfied" else "settled"
-    rests = latest >= max(rules.earliest, earliest, crew.still_from + rules.window) and observer.settled(rules.window, rules.distance)
+    rests = latest >= max(rules.earliest, earliest, supervisor.still_from + rules.window) and observer.settled(rules.window, rules.distance)
     return "settled" if rests else None
