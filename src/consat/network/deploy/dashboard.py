@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from consat.network.deploy.observer import AgentRecord, Observer
+from consat.network.node.station import REPORT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -87,5 +88,5 @@ def _state(record: AgentRecord, *, up: bool) -> str:
 
 
 def _rate(record: AgentRecord) -> float:
-    """Turns per second in the last report; reports come every 0.1 s."""
-    return len(record.report["track"]) / 0.1 if record.report else 0.0
+    """Turns per second in the last report."""
+    return len(record.report["track"]) / REPORT if record.report else 0.0

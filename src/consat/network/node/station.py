@@ -22,7 +22,7 @@ from consat.network.node.pairs import MessageLayout, halves, whole
 from consat.network.node.part import Part
 from consat.network.transports import Transport
 from consat.network.wire import VERSION, Expected, Kind, Message, Numbers, Reason
-from consat.numerics import float64
+from consat.numerics import float64, number
 from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.schedule import Schedule
 
@@ -322,10 +322,10 @@ class Station:
             block[:, column] += block[:, column] > 0
         return [block, *told[1:]]
 
-    def send_same(self, number: np.ndarray, to: Iterable[str]) -> None:
+    def send_same(self, round_: np.ndarray, to: Iterable[str]) -> None:
         """Say that a round brought no news."""
         for neighbour in to:
-            self.peers.send(neighbour, Kind.SAME, [number])
+            self.peers.send(neighbour, Kind.SAME, [round_])
 
     def send_hello(self) -> None:
         """Send a greeting, which contains the membership, to the neighbours."""
@@ -423,7 +423,7 @@ class Station:
             elif self._known == "satisfied":
                 self.log("satisfied", stamp=stamp)
             elif view is not None:
-                self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=_number(view.least))
+                self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=number(view.least))
 
     def _me(self) -> int:
         """The agent's row among the agents that are present."""
@@ -458,17 +458,17 @@ class Station:
         view, position = self._view, self.body.position()
         margin = estimate_margin = None
         if view is not None:
-            estimate_margin = _number(self.core.margin(view.x, self._time))
+            estimate_margin = number(self.core.margin(view.x, self._time))
             if view.heard and position is not None:
                 bodies = view.bodies.copy()
                 bodies[self._me()] = position
-                margin = _number(self.core.margin(bodies, self._time))
+                margin = number(self.core.margin(bodies, self._time))
         peers = {}
         for neighbour, peer in self.peers.all.items():
             if neighbour not in self._gone:
                 trip = None if np.isnan(peer.trip) else round(peer.trip, 6)
                 peers[neighbour] = {
-                    "up": neighbour not in self._down, "silent": _number(round(self.clock() - peer.heard, 4)),
+                    "up": neighbour not in self._down, "silent": number(round(self.clock() - peer.heard, 4)),
                     "loss": round(peer.lost, 4), "trip": trip,
                 }  # fmt: skip
         self.log(
@@ -477,18 +477,13 @@ class Station:
             margin=margin,
             estimate_margin=estimate_margin,
             known=None if view is None else view.known,
-            bound=None if view is None else _number(view.bound),
+            bound=None if view is None else number(view.bound),
             track=self._track,
             peers=peers,
             sent=dict(self.peers.sent),
             dropped=self.peers.dropped,
         )
         self._track = []
-
-
-def _number(value: float) -> float | None:
-    """A float for JSON; None where it is not finite."""
-    return value if np.isfinite(value) else None
 
 
 def _expected(
