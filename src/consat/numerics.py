@@ -42,6 +42,11 @@ def float64(function: Callable[P, T]) -> Callable[P, T]:
     return wrapped
 
 
+def number(value: Any) -> float | None:
+    """A float for JSON; None (null) where it is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
 def on_device(value: ArrayLike) -> Array:
     """The value as a JAX array with separate memory.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.modes import Manner
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import Part, split
 from consat.network.transports.memory import MemoryNetwork
 from consat.scenario import load
@@ -27,10 +27,10 @@ def off(rehearsal: Rehearsal) -> float:
     return max(float(np.abs(positions[agent] - np.array(goal)).max()) for agent, goal in GOAL.items() if agent in positions)
 
 
-def rehearse(manner: Manner, conditions: Faults | None = None, seed: int = 0, **options: object) -> Rehearsal:
+def rehearse(settings: NodeSettings, conditions: Faults | None = None, seed: int = 0, **options: object) -> Rehearsal:
     """All three agents, started; in lockstep they run admm."""
     made = Rehearsal(
-        parts(*ADMM if manner.mode == "lockstep" else ()), manner, MemoryNetwork(replace(conditions or Faults(), seed=seed)), **options
+        parts(*ADMM if settings.mode == "lockstep" else ()), settings, MemoryNetwork(replace(conditions or Faults(), seed=seed)), **options
     )  # type: ignore[arg-type]
     made.start()
     return made

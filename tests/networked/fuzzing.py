@@ -19,22 +19,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consat.network.node.pairs import INDEFINITE, Letter
+from consat.network.node.pairs import INDEFINITE, MessageLayout
 from consat.network.wire import Checker, Kind, Message, Numbers, Reason, encode
 
 PROBLEM = bytes(range(8))
 ME = "änn"
 INF = math.inf
-LETTER = Letter(names=(("x", 0), None), level=True)
+LAYOUT = MessageLayout(names=(("x", 0), None), level=True)
 """Mail of the interior-point protocol about one coordinate and the level: count, μ, t and the least margin, then L11, L12, L22, e1, e2; and
 Σλ, c, the error, L11 and e1 of the proof."""
 QUADRATIC = 8
 """Numbers of its half of 32 bits, see `consat.network.node.pairs.halves`."""
 EXPECTED: dict[str, dict[Kind, list[Any]]] = {
-    "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)], Kind.RESEND: [(1, 2), LETTER.numbers()]},
+    "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)], Kind.RESEND: [(1, 2), LAYOUT.numbers()]},
     "carol": {Kind.STATE: [Numbers((2, 6), (9.0, 9.0, INF, 100.0, 100.0, 1e6))]},  # as of estimates, a margin, a body, and its age
     "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)], Kind.SAME: [(1,)]},
-    "dave": {Kind.STATE: [(1, 2), *LETTER.brief()], Kind.SAME: [Numbers((3,), 100.0, single=True)]},
+    "dave": {Kind.STATE: [(1, 2), *LAYOUT.brief()], Kind.SAME: [Numbers((3,), 100.0, single=True)]},
 }
 WINDOW = {Reason.DUPLICATE, Reason.STALE, Reason.JUMP}
 INTERESTING = (0, 1, 2, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
@@ -140,14 +140,14 @@ def _float(data: bytes) -> float:
 
 
 def in_full(numbers: list[float]) -> list[float]:
-    """Mail as in `LETTER`: a half of it with another that makes sense."""
+    """Mail as in `LAYOUT`: a half of it with another that makes sense."""
     if len(numbers) == QUADRATIC:
         return [0.0, *numbers, 0.0, 0.0, 0.0, 0.0, 0.0]
     return numbers if len(numbers) > QUADRATIC else [numbers[0], *[0.0] * QUADRATIC, *numbers[1:]]
 
 
 def makes_sense(numbers: list[float]) -> bool:
-    """Whether mail is what an agent of sense can have sent; see `LETTER`. The eigenvalues of 2 × 2 are known in closed form."""
+    """Whether mail is what an agent of sense can have sent; see `LAYOUT`. The eigenvalues of 2 × 2 are known in closed form."""
     changes, barrier, _, _, a, b, c, _, _, weight, _, error, proof, _ = numbers
     scale = max(abs(a), abs(b), abs(c)) or 1.0
     a, b, c = a / scale, b / scale, c / scale

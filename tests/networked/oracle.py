@@ -15,7 +15,7 @@ import numpy as np
 import consat as cs
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.modes import Manner
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
 from consat.protocols.sending import Sends
@@ -43,7 +43,7 @@ def trajectories(
     """Of all agents by round, over the network in memory; those to be killed start again half a second later."""
     parts = split(load(name, [f"protocol.kind={protocol}"]), run="oracle")
     conditions = Faults(loss=loss, delay=(1e-4, 3e-3), repeat=0.1)
-    team = Rehearsal(parts, Manner("lockstep", turns=ROUNDS, report=0.0, sends=sends), MemoryNetwork(conditions))
+    team = Rehearsal(parts, NodeSettings("lockstep", turns=ROUNDS, report=0.0, sends=sends), MemoryNetwork(conditions))
     for agent in ("a1", "a2", "a3"):  # one after the other, as processes do
         team.start(agent, memory=folder / agent)
         team.run(0.02)

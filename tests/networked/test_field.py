@@ -22,8 +22,8 @@ from consat.network.deploy import process
 from consat.network.deploy.process import ProcessOptions, run_agent
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.body import VALID
-from consat.network.node.helm import PERIOD
-from consat.network.node.modes import Manner
+from consat.network.node.commander import PERIOD
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import Part, split
 from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
@@ -36,10 +36,10 @@ from tests.networked.case_c import events, parts, rehearse
 
 SPEED = 0.5
 MODES = {
-    "admm": Manner("admm", report=0.0),
-    "interior-point": Manner("interior-point", report=0.0),
-    "link": Manner("link", pace=20.0, report=0.0),
-    "lockstep": Manner("lockstep", rate=100.0, report=0.0),
+    "admm": NodeSettings("admm", report=0.0),
+    "interior-point": NodeSettings("interior-point", report=0.0),
+    "link": NodeSettings("link", pace=20.0, report=0.0),
+    "lockstep": NodeSettings("lockstep", rate=100.0, report=0.0),
 }
 
 
@@ -87,7 +87,7 @@ communication: {graph: line}
 smoothing: {nu_alpha: 5, nu_beta: 5}
 """)
     team = Rehearsal(
-        split(scenario, run="relays"), Manner("admm", report=0.0), MemoryNetwork(Faults(loss=0.3, delay=(0.0, 0.05))), speed=1.0
+        split(scenario, run="relays"), NodeSettings("admm", report=0.0), MemoryNetwork(Faults(loss=0.3, delay=(0.0, 0.05))), speed=1.0
     )
     team.start()
     team.run(20.0, lambda: bool(events(team, "satisfied")))
@@ -115,7 +115,7 @@ def test_no_one_is_satisfied_whose_body_is_lost() -> None:
 
 
 def test_in_lockstep_nobody_who_waits_stays_satisfied() -> None:
-    team = rehearse(Manner("lockstep", rate=100.0))
+    team = rehearse(NodeSettings("lockstep", rate=100.0))
     team.run(5.0)
     assert all(runner.station.satisfied for runner in team.runners.values())
     team.kill("a3")
@@ -192,7 +192,7 @@ def run(again: Callable[[], Part] | None = None, **around: Any) -> None:
     part = split(SOLO, run="solo")["solo"]
     run_agent(
         part,
-        Manner("admm", around.pop("rate", 20.0), turns=around.pop("turns", None)),
+        NodeSettings("admm", around.pop("rate", 20.0), turns=around.pop("turns", None)),
         ProcessOptions(**{"sensor": "stdin", "speed": 0.5, "until": PATIENCE} | around),
         again,
     )
@@ -358,7 +358,7 @@ def test_a_simulated_body_takes_no_measurements_and_gets_no_commands(robot: Robo
 
 def test_word_of_a_body_is_of_the_version_and_the_size_that_both_know() -> None:
     """Version 1 told of no bodies. A message is as long as it must be, and its numbers are finite."""
-    station = rehearse(Manner("admm")).runners["a2"].station
+    station = rehearse(NodeSettings("admm")).runners["a2"].station
     assert station.core.width == station.core.core.width + 4
     assert np.isfinite(station.core.largest[-4:]).all()
     assert parts()["a2"].team.dimension == 2
@@ -438,4 +438,4 @@ def test_one_on_standby_joins_when_told(robot: Robot) -> None:
 def test_constraints_that_move_need_somebody_to_say_when() -> None:
     moving = loads(SOLO.text.replace("[0, 0]", "{times: [0, 1], values: [[0, 0], [1, 1]]}"))
     with pytest.raises(InvalidSettings, match="nobody says when t = 0 is; say --epoch"):
-        run_agent(split(moving)["solo"], Manner("admm"), ProcessOptions())
+        run_agent(split(moving)["solo"], NodeSettings("admm"), ProcessOptions())

@@ -14,8 +14,8 @@ from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard, pair_core
 from consat.network.node.core import Embodied, Moment
-from consat.network.node.modes import Manner, core_of
-from consat.network.node.pairs import HEAD, Letter, Packing
+from consat.network.node.modes import NodeSettings, core_of
+from consat.network.node.pairs import HEAD, MessageLayout, Packing
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
 from consat.network.wire import Message, encode
@@ -23,7 +23,7 @@ from consat.numerics import float64
 from consat.scenario import load, loads
 from tests.networked.case_c import events
 
-MANNER = Manner("interior-point", report=0.0)
+MANNER = NodeSettings("interior-point", report=0.0)
 BEST = {"case-c": math.inf, "case-d": -0.0814394460511299}
 """The upper bound that `consat solve` proves of the best margin; of the feasible team nobody asks."""
 CONDITIONS = {
@@ -142,7 +142,7 @@ def test_a_proof_of_another_team_is_not_used() -> None:
     last = station.peers.all["a2"].last
     assert last is not None
     inbox, arrived = station.core.empty()
-    station.sort("a2", last.arrays, inbox, arrived)
+    station.deliver("a2", last.arrays, inbox, arrived)
     assert arrived.pair.tolist() == [True]
     found = {}
     for mine, theirs in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)):
@@ -166,7 +166,9 @@ def test_one_that_was_absent_joins() -> None:
 
 
 def test_lockstep_survives_a_departure() -> None:
-    team = Rehearsal(split(load("case-d"), run="lockstep"), Manner("lockstep", rate=100.0, report=0.0), MemoryNetwork(Faults(loss=0.3)))
+    team = Rehearsal(
+        split(load("case-d"), run="lockstep"), NodeSettings("lockstep", rate=100.0, report=0.0), MemoryNetwork(Faults(loss=0.3))
+    )
     team.start()
     wait(team, "infeasible")
     team.runners["a3"].leave()
@@ -176,7 +178,7 @@ def test_lockstep_survives_a_departure() -> None:
 
 # -- lies ----------------------------------------------------------------------------------------------------------------------------------
 
-Change = Callable[[np.ndarray, Letter], None]
+Change = Callable[[np.ndarray, MessageLayout], None]
 
 
 def forge(team: Rehearsal, source: str, victim: str, change: Change) -> None:
@@ -186,7 +188,7 @@ def forge(team: Rehearsal, source: str, victim: str, change: Change) -> None:
     assert last is not None
     assert last.arrays
     mail = last.arrays[1].copy()
-    change(mail, Letter.of(known, 2))
+    change(mail, MessageLayout.of(known, 2))
     team.network._open[victim].queue.append(encode(_next(last, mail)))
 
 
@@ -195,7 +197,7 @@ def _next(last: Message, mail: np.ndarray) -> Message:
 
 
 def put(value: float, *places: int) -> Change:
-    def change(mail: np.ndarray, letter: Letter) -> None:
+    def change(mail: np.ndarray, layout: MessageLayout) -> None:
         mail[list(places)] = value
 
     return change
@@ -204,9 +206,9 @@ def put(value: float, *places: int) -> Change:
 def quadratic(value: float, *, proof: bool) -> Change:
     """A multiple of the identity."""
 
-    def change(mail: np.ndarray, letter: Letter) -> None:
-        size = letter.size - (letter.level if proof else 0)
-        at = _tail(letter) + 3 if proof else HEAD
+    def change(mail: np.ndarray, layout: MessageLayout) -> None:
+        size = layout.size - (layout.level if proof else 0)
+        at = _tail(layout) + 3 if proof else HEAD
         triangle = np.zeros((size, size))
         np.fill_diagonal(triangle, value)
         mail[at : at + size * (size + 1) // 2] = triangle[np.triu_indices(size)]
@@ -215,22 +217,22 @@ def quadratic(value: float, *, proof: bool) -> Change:
 
 
 def weight(value: float) -> Change:
-    return lambda mail, letter: mail.__setitem__(_tail(letter), value)
+    return lambda mail, layout: mail.__setitem__(_tail(layout), value)
 
 
 def bound(value: float) -> Change:
     """A proof that the margin is at most about `value`."""
 
-    def change(mail: np.ndarray, letter: Letter) -> None:
-        mail[_tail(letter) :] = 0.0
-        mail[_tail(letter) : _tail(letter) + 2] = 1e6, 1e6 * value
-        quadratic(1.0, proof=True)(mail, letter)
+    def change(mail: np.ndarray, layout: MessageLayout) -> None:
+        mail[_tail(layout) :] = 0.0
+        mail[_tail(layout) : _tail(layout) + 2] = 1e6, 1e6 * value
+        quadratic(1.0, proof=True)(mail, layout)
 
     return change
 
 
-def _tail(letter: Letter) -> int:
-    return HEAD + letter.size * (letter.size + 1) // 2 + letter.size
+def _tail(layout: MessageLayout) -> int:
+    return HEAD + layout.size * (layout.size + 1) // 2 + layout.size
 
 
 REFUSED = {
@@ -300,7 +302,7 @@ def test_a_lie_that_makes_sense_does_no_lasting_harm(satisfied: Rehearsal, lie: 
 
 
 def core(name: str = "case-c", agent: str = "a2") -> Embodied:
-    return core_of(split(load(name), run="x")[agent], Manner("interior-point"))
+    return core_of(split(load(name), run="x")[agent], NodeSettings("interior-point"))
 
 
 def moment(made: Embodied) -> Moment:
@@ -330,8 +332,8 @@ def test_guard_leaves_out_whose_mail_is_poison() -> None:
     inbox.pair[0, 1:] = math.nan
     got = guard.turn(made, state, inbox, arrived, moment(made))
     assert got.refused == ("a1",)
-    assert all(np.isfinite(leaf).all() for leaf in (got.look.x, got.outbox.link))
-    np.testing.assert_array_equal(got.look.x, good.look.x)
+    assert all(np.isfinite(leaf).all() for leaf in (got.view.x, got.outbox.link))
+    np.testing.assert_array_equal(got.view.x, good.view.x)
 
 
 RELAYED = """
@@ -348,12 +350,12 @@ communication: {graph: line}
 def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
     """Of symmetric matrices the triangles, and of all only what the two share."""
     whole = split(loads(RELAYED), run="x")["b"]
-    made = core_of(whole, Manner("interior-point"))
+    made = core_of(whole, NodeSettings("interior-point"))
     interior = made.core.solver.interior
     assert interior is not None
     width = interior.plan.width
-    packing, letters = Packing.of(whole, whole, width), [Letter.of(neighbour, 2) for neighbour in whole.neighbours]
-    assert [letter.size for letter in letters] == [5, 3]  # b tells a of a, c and the level; c only of c
+    packing, layouts = Packing.of(whole, whole, width), [MessageLayout.of(neighbour, 2) for neighbour in whole.neighbours]
+    assert [layout.size for layout in layouts] == [5, 3]  # b tells a of a, c and the level; c only of c
     random = np.random.default_rng(0)
 
     def drawn(leaf: np.ndarray) -> np.ndarray:
@@ -362,11 +364,11 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
 
     mail = jax.tree.map(drawn, interior.silence())
     numbers = np.asarray(packing.pack(mail._replace(changes=np.full(2, 3.0))))
-    assert [np.flatnonzero(row)[-1] + 1 for row in numbers] == [letter.length for letter in letters]
+    assert [np.flatnonzero(row)[-1] + 1 for row in numbers] == [layout.length for layout in layouts]
     back = packing.unpack(numbers, width)
     assert np.asarray(back.changes).tolist() == [3.0, 3.0]
-    for row, letter in enumerate(letters):
-        p, q = letter.size, letter.size - 1
+    for row, layout in enumerate(layouts):
+        p, q = layout.size, layout.size - 1
         for got, sent in ((back.matrix, mail.matrix), (back.vector, mail.vector)):
             np.testing.assert_array_equal(got[row][(slice(p),) * (got.ndim - 1)], sent[row][(slice(p),) * (got.ndim - 1)])
         np.testing.assert_array_equal(back.proof.matrix[row, :q, :q], mail.proof.matrix[row, :q, :q])
@@ -379,14 +381,14 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
 def test_mail_keeps_its_places_when_somebody_has_gone() -> None:
     """And is 0 where it was about them."""
     whole = split(loads(RELAYED), run="x")["b"]
-    less = core_of(whole, Manner("interior-point")).among({"a"})
+    less = core_of(whole, NodeSettings("interior-point")).among({"a"})
     assert [neighbour.id for neighbour in less.part.neighbours] == ["c"]
     state = less.begin(less.part.first)
     _, said, _ = less.turn(state, *less.empty(), moment(less))
-    (letter,) = [Letter.of(neighbour, 2) for neighbour in whole.neighbours if neighbour.id == "c"]
-    assert said.pair.shape == (1, letter.length)
-    assert letter.numbers().sound is not None
-    assert letter.numbers().sound(said.pair[0])  # type: ignore[misc]
+    (layout,) = [MessageLayout.of(neighbour, 2) for neighbour in whole.neighbours if neighbour.id == "c"]
+    assert said.pair.shape == (1, layout.length)
+    assert layout.numbers().sound is not None
+    assert layout.numbers().sound(said.pair[0])  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("protocol", ["interior-point", "max-min"])

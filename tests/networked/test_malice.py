@@ -19,12 +19,12 @@ from consat.network.node import guard
 from consat.network.node.core import Moment, RoundCore, Rows
 from consat.network.node.lockstep import Lockstep
 from consat.network.node.membership import MOST, Membership
-from consat.network.node.modes import Manner, core_of
+from consat.network.node.modes import NodeSettings, core_of
 from consat.network.wire import AHEAD, Kind, Message, encode
 from consat.numerics import float64
 from tests.networked.case_c import GOAL, parts, rehearse
 
-MANNERS = {"admm": Manner("admm"), "link": Manner("link", pace=20.0), "lockstep": Manner("lockstep", rate=100.0)}
+SETTINGS = {"admm": NodeSettings("admm"), "link": NodeSettings("link", pace=20.0), "lockstep": NodeSettings("lockstep", rate=100.0)}
 SETTLED = 2.0
 """Seconds in which each of them is near the optimum: the forger comes when all seems well."""
 
@@ -109,7 +109,7 @@ CASES = {
 @pytest.mark.parametrize(("mode", "poison"), [(mode, poison) for mode, poisons in CASES.items() for poison in poisons])
 def test_one_poisoned_message_does_no_lasting_harm(mode: str, poison: str) -> None:
     """Sent to the middle of the line, and to one of its ends, which hears nobody else."""
-    team = rehearse(MANNERS[mode])
+    team = rehearse(SETTINGS[mode])
     team.run(SETTLED)
     assert off(team) < 1e-2
     for source, victim in (("a1", "a2"), ("a2", "a3")):
@@ -125,7 +125,7 @@ def test_one_poisoned_message_does_no_lasting_harm(mode: str, poison: str) -> No
 @float64
 def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_others() -> None:
     """The checker refuses infinite penalties before; whatever it may overlook, the state stays finite."""
-    core = core_of(parts()["a2"], Manner("admm"))
+    core = core_of(parts()["a2"], NodeSettings("admm"))
     state = core.begin(core.part.first)
     inbox, arrived = core.empty()
     inbox.link[:] = np.abs(np.random.default_rng(0).normal(size=inbox.link.shape))  # penalties are positive
@@ -133,7 +133,7 @@ def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_ot
     moment = Moment(0.0, 0.01, np.zeros(len(arrived.link)), arrived.link, np.zeros(2))
     good = guard.turn(core, state, inbox, arrived, moment)
     assert good.refused == ()
-    np.testing.assert_array_equal(good.look.x, core.turn(state, inbox, arrived, moment)[2].x)
+    np.testing.assert_array_equal(good.view.x, core.turn(state, inbox, arrived, moment)[2].x)
     from_a1 = np.array([neighbour == "a1" for neighbour, _ in core.ends])
     without = Rows(np.where(from_a1[:, None], 0.0, inbox.link), inbox.pair), Rows(~from_a1, arrived.pair)
     for poison in (math.inf, math.nan, -math.inf):
@@ -141,15 +141,15 @@ def test_guard_leaves_out_the_neighbour_whose_message_is_poison_and_hears_the_ot
         assert not np.isfinite(core.turn(state, spoilt, arrived, moment)[2].x).all(), "negative control"
         got = guard.turn(core, state, spoilt, arrived, moment)
         assert got.refused == ("a1",)
-        np.testing.assert_array_equal(got.look.x, core.turn(state, *without, moment)[2].x)
+        np.testing.assert_array_equal(got.view.x, core.turn(state, *without, moment)[2].x)
         everything = guard.turn(core, state, inbox._replace(link=np.full_like(inbox.link, poison)), arrived, moment)
         assert everything.refused == ("a1", "a3")
-        assert np.isfinite(everything.look.x).all()
+        assert np.isfinite(everything.view.x).all()
 
 
 def test_refused_neighbours_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RoundCore, "largest", property(lambda self: np.full(self.width, np.inf), lambda *_: None), raising=False)
-    team = rehearse(MANNERS["admm"])
+    team = rehearse(SETTINGS["admm"])
     team.run(SETTLED)
     forge(team, "a1", "a2", POISON["ρ = ∞"])
     team.run(1.0)
@@ -158,14 +158,14 @@ def test_refused_neighbours_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_flood_of_far_rounds_takes_no_memory() -> None:
-    team = rehearse(MANNERS["lockstep"])
+    team = rehearse(SETTINGS["lockstep"])
     team.run(SETTLED)
     runner = team.runners["a2"]
     assert isinstance(runner, Lockstep)
     before = runner._round
     for number in range(300):
         forge(team, "a1", "a2", round_(before + 10.0 + 7 * number))
-        runner._hear()
+        runner._receive()
     assert all(len(blocks) <= 3 for blocks in runner._blocks.values())
     assert before - 1 in runner._blocks["a1"] or runner._round == before
 
@@ -174,8 +174,8 @@ def test_who_is_said_to_have_left_always_has_the_last_word() -> None:
     for claim in (1.0, 77.0, MOST - 1, MOST, MOST + 1, 2.0**53, 1e300, -1.0, 0.5):
         mine, other = Membership(parts()["a1"]), Membership(parts()["a2"])
         for _ in range(3):
-            other.hear(["a1"], np.array([claim]))
-            mine.hear(["a1"], other.of(["a1"]))
-            other.hear(["a1"], mine.of(["a1"]))
+            other.update(["a1"], np.array([claim]))
+            mine.update(["a1"], other.of(["a1"]))
+            other.update(["a1"], mine.of(["a1"]))
         assert not mine.gone, claim
         assert not other.gone, claim

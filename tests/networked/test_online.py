@@ -16,7 +16,7 @@ import consat as cs
 from consat.errors import InvalidSettings, InvalidTeam
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.modes import Manner, Mode
+from consat.network.node.modes import Mode, NodeSettings
 from consat.network.node.orders import KEYS, Orders, order_of
 from consat.network.node.part import read_part, split, write_part
 from consat.network.transports.memory import MemoryNetwork
@@ -45,7 +45,7 @@ APART = STILL.replace("center: [0, 0]", "center: [20, 0]")
 def team_of(text: str, mode: Mode = "interior-point", conditions: Faults | None = None, **options: Any) -> Rehearsal:
     scenario = loads(text + ("protocol: {kind: admm}\n" if mode == "admm" else ""))
     parts = split(scenario, run="online", epoch=options.pop("epoch", 0.0))
-    made = Rehearsal(parts, Manner(mode, rate=options.pop("rate", 50.0), report=0.0), MemoryNetwork(conditions), **options)
+    made = Rehearsal(parts, NodeSettings(mode, rate=options.pop("rate", 50.0), report=0.0), MemoryNetwork(conditions), **options)
     made.start()
     return made
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from consat.cli.commands import cli
 from consat.errors import InvalidScenario, InvalidSettings, InvalidTeam
 from consat.network.node.part import Part, read_part, split, write_part
-from consat.network.node.problem import Alone, ends
+from consat.network.node.problem import OwnSolver, ends
 from consat.numerics import float64
 from consat.problem.team import Agent, Team
 from consat.scenario import Scenario, load, loads
@@ -74,7 +74,7 @@ def test_the_ends_of_a_link_know_each_others_degrees() -> None:
     made = split(load("example-1", ["protocol.estimates=full"]))
     weights = {}
     for agent, part in made.items():
-        for (neighbour, of), weight in zip(ends(part), np.asarray(Alone.of(part).links.metropolis), strict=True):
+        for (neighbour, of), weight in zip(ends(part), np.asarray(OwnSolver.of(part).links.metropolis), strict=True):
             weights[agent, neighbour, of] = weight
     assert weights
     assert all(weights[other, agent, of] == weight for (agent, other, of), weight in weights.items())

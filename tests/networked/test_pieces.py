@@ -16,7 +16,7 @@ from consat.network.deploy.environment import prepare
 from consat.network.deploy.observer import Observer
 from consat.network.node.body import CONFIRMED, MeasuredBody, Measurement, SimulatedBody
 from consat.network.node.membership import Membership
-from consat.network.node.modes import Manner, core_of
+from consat.network.node.modes import NodeSettings, core_of
 from consat.network.node.persistence import Store
 from consat.network.transports.faults import FaultyTransport
 from consat.network.transports.memory import LATENCY, MemoryNetwork
@@ -133,7 +133,7 @@ def test_losses_come_in_bursts() -> None:
 def test_members_are_the_same_in_whatever_order_news_come(news: list[tuple[str, float]]) -> None:
     known = Membership(parts()["a2"])
     for agent, epoch in news:
-        known.hear([agent], np.array([epoch]))
+        known.update([agent], np.array([epoch]))
     assert known.gone == {"a1", "a3"}
     assert known.of(["a1", "a2", "a3"]).tolist() == [3.0, 0.0, 1.0]
 
@@ -141,16 +141,16 @@ def test_members_are_the_same_in_whatever_order_news_come(news: list[tuple[str, 
 def test_whoever_is_falsely_said_to_have_left_objects() -> None:
     me, other = Membership(parts()["a1"]), Membership(parts()["a2"])
     other.drop("a1")
-    me.hear(["a1"], other.of(["a1"]))
+    me.update(["a1"], other.of(["a1"]))
     assert me.gone == frozenset()
-    assert other.hear(["a1"], me.of(["a1"]))
+    assert other.update(["a1"], me.of(["a1"]))
     assert other.gone == frozenset()
 
 
 @pytest.mark.parametrize("told", [np.nan, np.inf, -1.0, 0.5, 1e300])
 def test_absurd_numbers_of_members_are_ignored(told: float) -> None:
     known = Membership(parts()["a2"])
-    assert not known.hear(["a1"], np.array([told]))
+    assert not known.update(["a1"], np.array([told]))
     assert known.gone == frozenset()
 
 
@@ -175,9 +175,9 @@ def test_a_measured_body_stands_still_until_it_is_measured() -> None:
     np.testing.assert_allclose(body.follow(np.ones(2), 2.0), [0.0, 1.0])
 
 
-def sightings(body: MeasuredBody, *seen: tuple[float, float] | tuple[float, float, float]) -> list[bool]:
+def sightings(body: MeasuredBody, *record: tuple[float, float] | tuple[float, float, float]) -> list[bool]:
     """Which measurements (time, x) or (time, x, stamp) are believed."""
-    return [body.measure(Measurement(np.array([x, 0.0]), time, *stamp)) is None for time, x, *stamp in seen]
+    return [body.measure(Measurement(np.array([x, 0.0]), time, *stamp)) is None for time, x, *stamp in record]
 
 
 def at(body: MeasuredBody) -> float:
@@ -234,7 +234,7 @@ def test_a_body_that_is_not_measured_any_more_stands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("manner", "protocol", "message"),
+    ("settings", "protocol", "message"),
     [
         ({"mode": "carrier-pigeon"}, None, "there is no mode 'carrier-pigeon'"),
         ({"mode": "admm", "memory": Path("x")}, None, "only lockstep takes a memory file"),
@@ -245,9 +245,9 @@ def test_a_body_that_is_not_measured_any_more_stands() -> None:
         ({"mode": "lockstep"}, "gradient-flow", "mode lockstep runs protocols in rounds"),
     ],
 )
-def test_modes_that_do_not_fit_are_refused(manner: dict[str, object], protocol: str | None, message: str) -> None:
+def test_modes_that_do_not_fit_are_refused(settings: dict[str, object], protocol: str | None, message: str) -> None:
     with pytest.raises(InvalidSettings, match=message):
-        core_of(parts(*([f"protocol.kind={protocol}"] if protocol else []))["a2"], Manner(**manner))  # type: ignore[arg-type]
+        core_of(parts(*([f"protocol.kind={protocol}"] if protocol else []))["a2"], NodeSettings(**settings))  # type: ignore[arg-type]
 
 
 def test_the_environment_keeps_what_the_user_has_set() -> None:
@@ -284,8 +284,8 @@ def test_an_observer_counts_what_was_sent_in_all_lives() -> None:
     observer = Observer(load("case-c").team, np.zeros((3, 2)), "time")
     start = {"event": "start", "id": "a1", "t": 1.0}
     observer.take([start, report("a1", [], sent=5), report("a1", [], sent=7), start, report("a1", [], sent=2), {"event": "?", "id": "a1"}])
-    assert observer.seen["a1"].sent["messages"] == 9
-    assert observer.seen["a1"].sent["floats"] == 27
+    assert observer.records["a1"].sent["messages"] == 9
+    assert observer.records["a1"].sent["floats"] == 27
 
 
 def test_an_observer_knows_only_what_all_know() -> None:

@@ -16,8 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import consat as cs
 from consat.network.deploy import output
+from consat.network.deploy.commands import read_commands
 from consat.network.deploy.fleet import Event, Fleet, free_ports
+from consat.network.deploy.launch import Plan, Supervisor
+from consat.network.deploy.observer import Observer
 from consat.network.node.part import Part, split
 from consat.scenario import load
 from tests.networked.case_c import GOAL
@@ -88,14 +92,10 @@ def test_a_launch_carries_out_timed_commands(tmp_path: Path) -> None:
     assert result["motion"]["duration"] > 1.2
 
 
-def test_launch_gathers_a_result_as_any_run() -> None:
-    done = subprocess.run(
-        [*CONSAT, "launch", "case-c", "--mode", "admm", "--loss", "0.3", "--json"],
-        capture_output=True,
-        text=True,
-        timeout=START,
-        check=False,
-    )
+def test_launch_gathers_a_result_as_any_run(tmp_path: Path) -> None:
+    robots = ["--set", "robots={kind: point, radius: 0.1, speed: 1}"]
+    command = [*CONSAT, "launch", "case-c", *robots, "--mode", "admm", "--loss", "0.3", "--json", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START, check=False)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["schema"] == "consat.run/1"
@@ -105,6 +105,11 @@ def test_launch_gathers_a_result_as_any_run() -> None:
     assert result["network"]["loss"] == pytest.approx(0.3, abs=0.2)
     assert 0 < result["known_from"] == result["network"]["known_from"] < result["time"]
     assert result["satisfied_from"]["time"] <= result["network"]["known_from"] + 0.1  # who knows is right, up to a sample
+    [warning] = result["warnings"]
+    assert "launch simulates each robot as a point" in warning
+    begin = cs.Result.load(result["result"]).data["position"].values[0]
+    start = [part.first[part.team.ids.index(agent)] for agent, part in split(load("case-c")).items()]
+    np.testing.assert_array_equal(begin, start)
 
 
 def test_launch_ends_when_every_agent_knows_that_not_all_can_be_satisfied() -> None:
@@ -133,6 +138,30 @@ def test_agents_end_by_themselves_when_they_know_all_that_there_is_to_find() -> 
         assert told is not None
         assert told["near"]
         assert -0.0814394461 <= told["bound"] < 0 and told["margin"] == pytest.approx(-0.0814394, rel=0.06)  # noqa: PT018
+
+
+RING = """
+consat: 1
+name: ring
+agents:
+  - {id: a, constraints: [{kind: within, center: [0, 0], radius: 0.5}]}
+  - {id: b, constraints: [{kind: near, agent: a, radius: 0.5}]}
+  - {id: c, constraints: [{kind: near, agent: b, radius: 0.5}, {kind: within, center: [4, 0], radius: 0.5}]}
+  - {id: d, constraints: [{kind: near, agent: c, radius: 0.5}, {kind: near, agent: a, radius: 0.5}]}
+communication: {graph: ring}
+"""
+
+
+def test_a_torn_team_whose_links_form_a_loop_goes_over_to_a_tree_and_proves_that_it_is(tmp_path: Path) -> None:
+    """Along its loop nobody can prove it, and the launch would end undecided."""
+    (tmp_path / "ring.yaml").write_text(RING)
+    command = [*CONSAT, "launch", str(tmp_path / "ring.yaml"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START, check=False)
+    assert done.returncode == 4, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["status"], result["known"], result["ending"]) == ("least-violating", "infeasible", "settled")
+    assert (result["route"], result["network"]["ended"]) == ("tree", [])
+    assert result["margin"] == pytest.approx(-0.75, rel=0.05)  # two discs and two links share a distance of 4: 0.5² − 1²
 
 
 @pytest.fixture(scope="module")
@@ -234,8 +263,46 @@ def test_launch_mends_what_crashes_and_ctrl_c_leaves_nothing_behind(tmp_path: Pa
             assert launch.wait(START) == 130
         finally:
             launch.kill()
-    assert json.loads((tmp_path / "out").read_text())["ending"] == "interrupted"
+    told = json.loads((tmp_path / "out").read_text())
+    assert told["ending"] == "interrupted"
+    [ended] = told["network"]["ended"]
+    assert (ended["how"], ended["restarted"]) == ("SIGKILL", True)
+    assert f"the process of agent {ended['agent']!r} ended (SIGKILL)" in told["warnings"][0]
     assert not [pid for pid in agents if Path(f"/proc/{pid}").exists()]
+
+
+def test_who_ends_without_being_told_to_is_started_again_and_knows_what_it_knew() -> None:
+    """After a plain kill as after SIGKILL, and whoever ended is named. One that was told to leave stays away."""
+    scenario = load("case-c")
+    team, those = scenario.team, parts()
+    script = read_commands("- {at: 0, agent: a3, command: leave}", "commands", team, "interior-point")
+    observer = Observer(team, np.array([those[agent].first[those[agent].team.ids.index(agent)] for agent in GOAL]), "time")
+    with Fleet(those) as fleet:
+        supervisor = Supervisor(fleet, observer, Plan(), scenario, script, those)
+
+        def go_on(until: Callable[[], bool]) -> None:
+            end = time.monotonic() + START
+            while not until():
+                assert time.monotonic() < end, supervisor.endings(0.0)
+                observer.take(fleet.poll(0.05))
+                supervisor.mend()
+                supervisor.act()
+
+        def known() -> bool:
+            return supervisor.done == 1 and observer.all_known()[0] == "satisfied" and observer.records["a3"].ended is not None
+
+        for agent in GOAL:
+            supervisor.start(agent)
+        go_on(known)
+        for number, (agent, how) in enumerate((("a2", signal.SIGTERM), ("a1", signal.SIGKILL)), 1):
+            os.kill(fleet.pid(agent), how)
+            go_on(lambda number=number: len(supervisor.endings(0.0)) == number)  # type: ignore[misc]
+            assert not known()
+            go_on(known)
+        os.kill(fleet.pid("a1"), signal.SIGTERM)
+        listen(fleet, [], lambda: fleet.exit_code("a1") is not None, START)
+        told = [(each["agent"], each["how"], each["restarted"]) for each in supervisor.endings(0.0)]
+        assert told == [("a2", "SIGTERM", True), ("a1", "SIGKILL", True), ("a1", "exit code 0", False)]
 
 
 def _listens(pid: int) -> bool:

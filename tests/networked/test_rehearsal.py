@@ -14,10 +14,10 @@ import pytest
 
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.core import Embodied, Kept, Moment, Rows, Turned
+from consat.network.node.core import Embodied, IndexMap, Moment, Rows, StepResult
+from consat.network.node.fixed_rate import FixedRate
 from consat.network.node.link_core import LinkCore, LinkState
-from consat.network.node.modes import Manner, Runner
-from consat.network.node.paced import Paced
+from consat.network.node.modes import NodeSettings, Runner
 from consat.network.node.part import split
 from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
@@ -28,7 +28,7 @@ from tests.networked.oracle import EVENTS, TRIALS
 
 ROOT = Path(__file__).parents[2]
 DELAYS = (0.05, 0.2)
-MODES = {"admm": Manner("admm", rate=50.0), "link": Manner("link", rate=20.0, pace=20.0)}
+MODES = {"admm": NodeSettings("admm", rate=50.0), "link": NodeSettings("link", rate=20.0, pace=20.0)}
 PATIENCE = {"admm": 8.0, "link": 15.0}
 """Seconds to come within 1e-3 of the optimum: three times what they take with the worst of the seeds 0–4."""
 
@@ -80,7 +80,7 @@ def test_survives_a_crash_without_memory(mode: str, conditions: Faults) -> None:
 
 
 def test_lockstep_survives_a_crash_without_memory() -> None:
-    team = rehearse(Manner("lockstep"), Faults(loss=0.3, delay=(1e-3, 4e-3)))
+    team = rehearse(NodeSettings("lockstep"), Faults(loss=0.3, delay=(1e-3, 4e-3)))
     team.run(0.5)
     team.kill("a2")
     team.run(0.5)
@@ -103,7 +103,7 @@ def test_heals_after_a_partition(mode: str) -> None:
 
 
 def test_lockstep_waits_through_a_partition() -> None:
-    team = rehearse(Manner("lockstep", turns=150))
+    team = rehearse(NodeSettings("lockstep", turns=150))
     team.run(0.002)
     team.network.partition({"a1"}, {"a2", "a3"})
     team.run(5.0)
@@ -128,7 +128,7 @@ def assert_optimal_without_a3(team: Rehearsal, how: str) -> None:
 
 @pytest.mark.parametrize("how", ["admm", "link", "lockstep"])
 def test_survivors_go_on_without_an_agent_that_leaves(how: str) -> None:
-    team = rehearse(MODES.get(how, Manner("lockstep")), Faults(loss=0.3, delay=(1e-3, 2e-3)))
+    team = rehearse(MODES.get(how, NodeSettings("lockstep")), Faults(loss=0.3, delay=(1e-3, 2e-3)))
     team.run(1.0)
     team.runners["a3"].leave()
     team.run(PATIENCE.get(how, 2.0))
@@ -139,8 +139,8 @@ def test_survivors_go_on_without_an_agent_that_leaves(how: str) -> None:
 
 @pytest.mark.parametrize("how", ["admm", "link"])
 def test_one_silent_for_too_long_counts_as_gone(how: str) -> None:
-    manner = Manner(**{**vars(MODES[how]), "give_up": 2.0})
-    team = rehearse(manner)
+    settings = NodeSettings(**{**vars(MODES[how]), "give_up": 2.0})
+    team = rehearse(settings)
     team.run(1.0)
     team.kill("a3")
     team.run(1.5)
@@ -152,9 +152,9 @@ def test_one_silent_for_too_long_counts_as_gone(how: str) -> None:
 
 @pytest.mark.parametrize("how", ["admm", "link", "lockstep"])
 def test_one_that_was_absent_joins(how: str) -> None:
-    manner = MODES.get(how, Manner("lockstep"))
+    settings = MODES.get(how, NodeSettings("lockstep"))
     team = Rehearsal(
-        parts(*ADMM if how == "lockstep" else (), absent=("a3",)), manner, MemoryNetwork(Faults(loss=0.2, delay=(1e-3, 2e-3), seed=1))
+        parts(*ADMM if how == "lockstep" else (), absent=("a3",)), settings, MemoryNetwork(Faults(loss=0.2, delay=(1e-3, 2e-3), seed=1))
     )
     team.start("a1", "a2")
     team.run(PATIENCE.get(how, 2.0))
@@ -186,7 +186,7 @@ agents:
 communication: {graph: line}
 smoothing: {nu_alpha: 5, nu_beta: 5}
 """)
-    team = Rehearsal(split(scenario, run="relays"), Manner("admm"), MemoryNetwork(Faults(loss=0.3)))
+    team = Rehearsal(split(scenario, run="relays"), NodeSettings("admm"), MemoryNetwork(Faults(loss=0.3)))
     team.start()
     team.run(1.0)
     team.runners["a3"].leave()
@@ -205,7 +205,7 @@ def test_links_that_carry_nothing_shorten_no_way() -> None:
 
 
 def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
-    team = rehearse(Manner("admm", rate=50.0))
+    team = rehearse(NodeSettings("admm", rate=50.0))
     team.run(3.0)
     assert all(runner.station.satisfied for runner in team.runners.values())
     team.kill("a3")
@@ -217,7 +217,7 @@ def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
 
 
 def test_every_agent_learns_that_all_are_satisfied() -> None:
-    team = rehearse(Manner("admm"), Faults(loss=0.3))
+    team = rehearse(NodeSettings("admm"), Faults(loss=0.3))
     team.run(10.0, lambda: len({event["id"] for event in events(team, "satisfied")}) == 3)
     positions = np.array([team.positions()[agent] for agent in ("a1", "a2", "a3")])
     assert {event["id"] for event in events(team, "satisfied")} == {"a1", "a2", "a3"}
@@ -225,7 +225,7 @@ def test_every_agent_learns_that_all_are_satisfied() -> None:
 
 
 def test_no_agent_believes_what_is_not_so() -> None:
-    team = Rehearsal(split(_load("case-d"), run="d"), Manner("admm"), MemoryNetwork())
+    team = Rehearsal(split(_load("case-d"), run="d"), NodeSettings("admm"), MemoryNetwork())
     team.start()
     team.run(5.0)
     assert not events(team, "satisfied")
@@ -247,14 +247,14 @@ def margin(name: str, positions: np.ndarray) -> float:
 def test_same_seed_same_run() -> None:
     runs = []
     for seed in (3, 3, 4):
-        team = rehearse(Manner("admm"), Faults(loss=0.3, delay=DELAYS, repeat=0.1), seed)
+        team = rehearse(NodeSettings("admm"), Faults(loss=0.3, delay=DELAYS, repeat=0.1), seed)
         team.run(2.0)
         runs.append(team.events)
     assert json.dumps(runs[0]) == json.dumps(runs[1]) != json.dumps(runs[2])
 
 
 def test_a_body_keeps_to_its_speed_limit() -> None:
-    team = rehearse(Manner("admm", report=0.0), speed=0.5)
+    team = rehearse(NodeSettings("admm", report=0.0), speed=0.5)
     start = team.positions()
     team.run(20.0)
     for agent in start:
@@ -271,23 +271,23 @@ def test_a_body_keeps_to_its_speed_limit() -> None:
 class Naive(LinkCore):
     """The paper's flow sampled naively: each end of a link integrates its own idea of the difference, ż = k1 k2 Σ (x − x̂)."""
 
-    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         kept = state.force
         after, said, x, *_ = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
         integral = kept + self.k1 * self.k2 * moment.elapsed * (self.solver.links.at(after.x) - after.there)
         state = after._replace(force=integral, theirs=-integral, valid=jnp.zeros_like(after.valid))
         outbox = said.link.copy()
         outbox[:, -1] = 0.0  # says nothing of its integral
-        return Turned(state, Rows(outbox, said.pair), x)
+        return StepResult(state, Rows(outbox, said.pair), x)
 
     def among(self, gone: Any) -> "Naive":
         return Naive(self.whole, self.k1, self.k2, gone)
 
 
 def sampled(core: type[LinkCore]) -> Any:
-    def build(part: Any, manner: Manner, transport: Any, **options: Any) -> Runner:
+    def build(part: Any, settings: NodeSettings, transport: Any, **options: Any) -> Runner:
         made = Embodied(core(part, 1.0, 1.0))
-        return Paced(Station(part, made, "link", transport, **options), {"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
+        return FixedRate(Station(part, made, "link", transport, **options), {"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
 
     return build
 
@@ -296,7 +296,7 @@ def test_the_flow_sampled_naively_goes_to_the_wrong_place() -> None:
     """And with its integral on the links, at the same rates and losses, it does not."""
     found = {}
     for core in (Naive, LinkCore):
-        team = rehearse(Manner("link"), Faults(loss=0.3), build=sampled(core))
+        team = rehearse(NodeSettings("link"), Faults(loss=0.3), build=sampled(core))
         team.run(100.0)
         found[core] = off(team)
     assert found[Naive] > 0.02
@@ -313,4 +313,4 @@ def test_kept_rows_and_ends_are_found_by_name() -> None:
         assert less.carry(whole, state, less.part.first).force.tolist() == [[3.0, 3.0]]
         back = whole.carry(less, less.carry(whole, state, less.part.first), whole.part.first)
         assert back.force.tolist() == [[0.0, 0.0], [3.0, 3.0]]
-        assert Kept.of(less, whole).row.tolist() == [1, 2]
+        assert IndexMap.of(less, whole).row.tolist() == [1, 2]

@@ -11,15 +11,15 @@ import pytest
 from consat.errors import InvalidSettings
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.modes import Manner
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
 from consat.network.wire import Kind, Message, encode
 from consat.scenario import load
 
 
-def rehearse(manner: Manner, conditions: Faults = Faults(), seed: int = 0) -> Rehearsal:  # noqa: B008
-    team = Rehearsal(split(load("case-c"), run="sends"), manner, MemoryNetwork(replace(conditions, seed=seed)))
+def rehearse(settings: NodeSettings, conditions: Faults = Faults(), seed: int = 0) -> Rehearsal:  # noqa: B008
+    team = Rehearsal(split(load("case-c"), run="sends"), settings, MemoryNetwork(replace(conditions, seed=seed)))
     team.start()
     return team
 
@@ -35,7 +35,7 @@ def satisfied(team: Rehearsal) -> bool:
 @pytest.mark.parametrize("mode", ["interior-point", "admm"])
 @pytest.mark.parametrize("conditions", [Faults(), Faults(loss=0.3, delay=(0.0, 0.02))], ids=["perfect", "loss"])
 def test_all_know_and_then_only_hearts_beat(mode: Any, conditions: Faults) -> None:
-    team = rehearse(Manner(mode, sends="events"), conditions)
+    team = rehearse(NodeSettings(mode, sends="events"), conditions)
     assert team.run(20.0, until=lambda: satisfied(team))
     team.run(20.0)
     before = sent(team)
@@ -47,7 +47,7 @@ def test_all_know_and_then_only_hearts_beat(mode: Any, conditions: Faults) -> No
 
 
 def test_a_crashed_agent_is_told_everything_again() -> None:
-    team = rehearse(Manner("interior-point", sends="events"))
+    team = rehearse(NodeSettings("interior-point", sends="events"))
     assert team.run(20.0, until=lambda: satisfied(team))
     team.run(5.0)
     team.kill("a2")
@@ -59,14 +59,14 @@ def test_a_crashed_agent_is_told_everything_again() -> None:
 def test_lockstep_says_in_few_bytes_that_nothing_is_new() -> None:
     bytes_ = {}
     for sends in ("all", "events"):
-        team = rehearse(Manner("lockstep", turns=200, report=0.0, sends=sends))  # type: ignore[arg-type]
+        team = rehearse(NodeSettings("lockstep", turns=200, report=0.0, sends=sends))  # type: ignore[arg-type]
         team.run(30.0, until=lambda team=team: all(runner._round >= 200 for runner in team.runners.values()))  # type: ignore[attr-defined, misc]
         bytes_[sends] = sent(team, "bytes")
     assert 2.5 * bytes_["events"] < bytes_["all"]
 
 
 def test_agents_that_send_otherwise_are_not_understood() -> None:
-    team = Rehearsal(split(load("case-c"), run="sends"), Manner("interior-point"), MemoryNetwork())
+    team = Rehearsal(split(load("case-c"), run="sends"), NodeSettings("interior-point"), MemoryNetwork())
     team.start("a1", "a3", sends="events")
     team.start("a2")
     team.run(1.0)
@@ -74,7 +74,7 @@ def test_agents_that_send_otherwise_are_not_understood() -> None:
 
 
 def test_another_version_is_refused_with_a_line() -> None:
-    team = rehearse(Manner("interior-point"))
+    team = rehearse(NodeSettings("interior-point"))
     team.run(0.1)
     old = bytearray(encode(Message(Kind.GOODBYE, bytes(8), "a1", "a2", 1, 1, 0.0, np.nan, 0, 5.0)))
     old[4] = 3
@@ -87,6 +87,6 @@ def test_another_version_is_refused_with_a_line() -> None:
 
 def test_link_sends_all() -> None:
     with pytest.raises(InvalidSettings, match="mode link"):
-        Manner("link", sends="events")
+        NodeSettings("link", sends="events")
     with pytest.raises(InvalidSettings, match="must be one of all, events"):
-        Manner("admm", sends="some")  # type: ignore[arg-type]
+        NodeSettings("admm", sends="some")  # type: ignore[arg-type]

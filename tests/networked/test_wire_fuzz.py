@@ -46,7 +46,7 @@ def test_second_opinion_has_a_crc_of_its_own() -> None:
 
 
 def test_fuzzing_finds_a_checker_that_overlooks_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Negative control: without a look at the checksum, the two disagree soon."""
+    """Negative control: without a view at the checksum, the two disagree soon."""
     honest = Checker._broken
 
     def lax(self: Checker, payload: bytes) -> Reason | None:

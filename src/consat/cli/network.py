@@ -183,12 +183,12 @@ def agent(
     prepare_own(exact=mode == "lockstep")
     from consat.faults import Faults
     from consat.network.deploy.process import ProcessOptions, run_agent
-    from consat.network.node.modes import Manner, mode_for
+    from consat.network.node.modes import NodeSettings, mode_for
     from consat.network.node.part import is_part, load_text, read_part
 
     speed = options.pop("speed")
     part = _part(scenario, agent, overrides, port, mode)
-    manner = Manner(
+    node = NodeSettings(
         mode or mode_for(part.settings.protocol.kind), rate, pace, rounds, memory, math.inf if give_up is None else give_up, report, sends
     )
     if options["robot"] is not None and options["sensor"] != "stdin":
@@ -200,7 +200,7 @@ def agent(
     again = (lambda: read_part(load_text(file), scenario)) if file.is_file() and is_part(load_text(file), scenario) else None
     faults = Faults(options.pop("loss"), seed=options.pop("seed"), burst=options.pop("burst"), delay=options.pop("delay"))
     options |= {"faults": faults, "speed": math.inf if speed is None else speed, "keys": _keys(keys, scenario, [agent])}
-    run_agent(part, manner, ProcessOptions(**options), again)
+    run_agent(part, node, ProcessOptions(**options), again)
     return DONE
 
 
@@ -240,6 +240,7 @@ def launch(
     """
     prepare_own(exact=False)
     from consat.engine.files import claim
+    from consat.faults import Faults
     from consat.network.deploy.launch import Plan
     from consat.network.deploy.launch import launch as launch_team
     from consat.network.node.modes import mode_for
@@ -249,6 +250,7 @@ def launch(
 
     loaded = _with(load(scenario, overrides), protocol, estimates, seed)
     asked = loaded.settings.protocol
+    plan["faults"] = Faults(plan.pop("loss"), burst=plan.pop("burst"), delay=plan.pop("delay"))
     plan["mode"] = plan["mode"] or mode_for(asked.kind or default_protocol(loaded.team, asked.estimates))
     if out is not None:
         claim(out, loaded.name, force=force)

@@ -14,7 +14,7 @@ import numpy as np
 from consat.errors import Fault, InvalidExpression
 from consat.numerics import float64
 from consat.problem.constraints.record import Constraint
-from consat.problem.family import Part
+from consat.problem.family import FamilyPart
 from consat.problem.parameters import Path
 from consat.problem.schedule import Schedule, Track
 
@@ -114,15 +114,15 @@ def _mistake(entry: Entry, dimension: int) -> tuple[str, int]:
     return "", 0
 
 
-def alike(entries: Sequence[Entry]) -> list[Part]:
-    """Groups entries by family: one `Part` per family."""
+def alike(entries: Sequence[Entry]) -> list[FamilyPart]:
+    """Groups entries by family: one `FamilyPart` per family."""
     members: dict[tuple[Any, ...], list[Entry]] = {}
     turns: dict[tuple[Any, ...], list[int]] = {}
     for turn, entry in enumerate(entries):
         members.setdefault(entry.family, []).append(entry)
         turns.setdefault(entry.family, []).append(turn)
     return [
-        Part(
+        FamilyPart(
             kind=group[0].constraint.kind,
             psi=group[0].constraint.psi,
             agents=np.array([entry.agents for entry in group], dtype=np.int32),

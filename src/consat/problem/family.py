@@ -80,7 +80,7 @@ class Family:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class FamilyPart:
     """M constraints to be merged into a `Family` by `assemble`; not yet numbered.
 
     Attributes:
@@ -115,7 +115,7 @@ class Part:
         return self.psi, self.agents.shape[1], shapes
 
 
-def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
+def assemble(parts: Sequence[FamilyPart]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
     """Merges parts into families and numbers the constraints by owner.
 
     Returns:
@@ -152,7 +152,7 @@ def assemble(parts: Sequence[Part]) -> tuple[tuple[Family, ...], np.ndarray, Seq
     return tuple(families), owner if order is None else owner[order], names
 
 
-def _tracks(parts: Sequence[Part]) -> dict[str, Track]:
+def _tracks(parts: Sequence[FamilyPart]) -> dict[str, Track]:
     """The tracks of parts that become one family, joined."""
     starts = np.cumsum([0, *(len(part.owner) for part in parts)]).tolist()
     found: dict[str, list[tuple[Track, int]]] = {}
@@ -172,7 +172,7 @@ def _written(values: np.ndarray, rows: np.ndarray, new: Any) -> np.ndarray:
     return changed
 
 
-def _order(parts: Sequence[Part], owner: np.ndarray) -> np.ndarray | None:
+def _order(parts: Sequence[FamilyPart], owner: np.ndarray) -> np.ndarray | None:
     """(M,) permutation that sorts the constraints by owner and then by `turn`; None if they are sorted already."""
     turns = [part.turn for part in parts if part.turn is not None]
     first = np.argsort(np.concatenate(turns)) if turns else np.zeros(0, dtype=np.intp)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from consat.errors import Fault, closest, shown
 from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
-from consat.problem.family import Counted, Derived, Part, Repeated
+from consat.problem.family import Counted, Derived, FamilyPart, Repeated
 from consat.problem.parameters import LARGEST, Path, checked, checked_rows, is_number
 from consat.problem.schedule import Schedule, Track
 
@@ -194,9 +194,9 @@ class Expansion:
     def __post_init__(self) -> None:
         self.layout = layout(self.group, self.dimension)
 
-    def parts(self) -> list[tuple[Part, Constraint, Path, str]]:
+    def parts(self) -> list[tuple[FamilyPart, Constraint, Path, str]]:
         """For each constraint of the group: the part with one row per owner, the constraint, and its place in the input, for faults."""
-        made: list[tuple[Part, Constraint, Path, str]] = []
+        made: list[tuple[FamilyPart, Constraint, Path, str]] = []
         named: dict[str, Path] = {}
         for path, entry in self.entries():
             constraint = entry.constraint
@@ -234,7 +234,7 @@ class Expansion:
             return True
         return False
 
-    def part(self, entry: Each, path: Path, where: str) -> Part | None:
+    def part(self, entry: Each, path: Path, where: str) -> FamilyPart | None:
         """The part for one constraint of the group, with one row per owner and agent read, without names; None if it has faults."""
         constraint, known = entry.constraint, len(self.faults)
         rows = self.members(entry.of, path, where)
@@ -257,7 +257,7 @@ class Expansion:
             self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
         if len(self.faults) > known or isinstance(weight, Schedule):
             return None
-        return Part(
+        return FamilyPart(
             kind=constraint.kind,
             psi=constraint.psi,
             agents=np.stack(columns, axis=1).astype(np.int32),
@@ -410,7 +410,7 @@ class Expansion:
             return one
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
 
-    def told_apart(self, made: list[tuple[Part, Constraint, Path, str]]) -> list[tuple[Part, Constraint, Path, str]]:
+    def told_apart(self, made: list[tuple[FamilyPart, Constraint, Path, str]]) -> list[tuple[FamilyPart, Constraint, Path, str]]:
         """The same list with names. A name that one owner would have twice gets a number."""
         stems: dict[str, list[int]] = {}
         others = []

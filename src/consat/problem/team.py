@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from consat.errors import Fault, InvalidTeam, closest, shown
 from consat.problem.constraints.record import OWNER, Constraint, Constraints, Fixed, Number, flatten
 from consat.problem.entries import SUGGESTIONS, Entry, alike, trace
-from consat.problem.family import Chosen, Counted, Family, Joined, Part, assemble, distinct
+from consat.problem.family import Chosen, Counted, Family, FamilyPart, Joined, assemble, distinct
 from consat.problem.groups import Expansion, Group, faults_of, stems_clash
 from consat.problem.parameters import Path, checked, still, vector
 from consat.problem.schedule import FOREVER
@@ -125,7 +125,7 @@ class Team:
             self.names = tuple(self.names)
         self.links = _unique(pairs, self.count) if pairs is not None else topology(cast(str, links), self.count, self.families)
 
-    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[Part]:
+    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[FamilyPart]:
         expansion = Expansion(group, first, index.ids, index.get, self.dimension, path, faults)
         mine = slice(first, first + group.count)
         if group.start is not None:
@@ -232,7 +232,7 @@ class Team:
             kept = family.members((place[family.agents] >= 0).all(axis=1))
             numbers.append(kept.number)
             parts.append(
-                Part(
+                FamilyPart(
                     kind=family.kind,
                     psi=family.psi,
                     agents=place[kept.agents],

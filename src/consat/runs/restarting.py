@@ -12,13 +12,12 @@ from consat.engine.batch import Case, Lane, Then, simulate_batch
 from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness, turn_after
 from consat.engine.world import World, world_of
 from consat.faults import Faults
-from consat.numerics import float64
+from consat.numerics import float64, number
 from consat.problem.team import Team
 from consat.protocols import ROUNDS, with_gains
 from consat.protocols.estimates import Estimates
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared
-from consat.runs.summary import number
 from consat.settings import Settings, Start
 
 

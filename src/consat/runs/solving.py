@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from consat.certify.certificate import BINDING, bounds
-from consat.numerics import float64
+from consat.numerics import float64, number
 from consat.problem.team import Team
 from consat.problem.units import scale
 from consat.results.summaries import Verdict
 from consat.runs.preparation import scenario_of, with_auxiliary
-from consat.runs.summary import number
 from consat.scenario import Scenario
 
 SCHEMA = "consat.solve/1"

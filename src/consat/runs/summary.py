@@ -9,7 +9,7 @@ import numpy as np
 
 from consat import __version__
 from consat.certify.certificate import bounds
-from consat.numerics import on_device
+from consat.numerics import number, on_device
 from consat.problem.objective import Objective, SmoothingSchedule, weigh
 from consat.problem.team import Team
 from consat.problem.units import Scale
@@ -155,8 +155,3 @@ def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:
     for agent, label in zip(team.ids, cluster, strict=True):
         members[label].append(agent)
     return members
-
-
-def number(value: Any) -> float | None:
-    """A float for JSON; None (null) where it is not finite."""
-    return float(value) if np.isfinite(value) else None

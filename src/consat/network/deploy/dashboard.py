@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from consat.network.deploy.observer import Observer, Seen
+from consat.network.deploy.observer import AgentRecord, Observer
+from consat.network.node.station import REPORT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,23 +55,23 @@ def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: 
     from rich.table import Table
     from rich.text import Text
 
-    margins = [seen.report["margin"] for seen in observer.seen.values() if seen.report and seen.report["margin"] is not None]
+    margins = [record.report["margin"] for record in observer.records.values() if record.report and record.report["margin"] is not None]
     worst = f", margin {min(margins):+.4g}" if margins else ""
     known = _KNOWN.get(observer.all_known()[0] or "", "")
     drawn = Table(title=f"{title}: {seconds:.1f} s{worst}{known}", title_justify="left")
     for column in ("agent", "state", "margin", "turns/s", "loss", "round trip", "deaf to"):
         drawn.add_column(column, justify="left" if column in ("agent", "state", "deaf to") else "right")
-    for agent, seen in observer.seen.items():
+    for agent, record in observer.records.items():
         up = running.get(agent, False)
-        peers = seen.report["peers"] if seen.report else {}
-        margin = seen.report["margin"] if seen.report else None
+        peers = record.report["peers"] if record.report else {}
+        margin = record.report["margin"] if record.report else None
         loss = [peer["loss"] for peer in peers.values()]
         trips = [peer["trip"] for peer in peers.values() if peer["trip"] is not None]
         drawn.add_row(
             agent,
-            Text(_state(seen, up=up), style="" if up else "bold red"),
+            Text(_state(record, up=up), style="" if up else "bold red"),
             "" if margin is None else Text(f"{margin:+.4g}", style="green" if margin > 0 else "red"),
-            f"{_rate(seen):.0f}",
+            f"{_rate(record):.0f}",
             f"{np.mean(loss):.0%}" if loss else "",
             f"{1e3 * np.mean(trips):.1f} ms" if trips else "",
             Text(" ".join(other for other, peer in peers.items() if not peer["up"]), style="red"),
@@ -78,14 +79,14 @@ def table(title: str, observer: Observer, running: Mapping[str, bool], seconds: 
     return drawn
 
 
-def _state(seen: Seen, *, up: bool) -> str:
+def _state(record: AgentRecord, *, up: bool) -> str:
     if not up:
-        return "ended" if seen.ended is not None else "down"
-    if seen.report is None:
+        return "ended" if record.ended is not None else "down"
+    if record.report is None:
         return "starting"
-    return seen.known or ("running" if seen.stamps else "waiting")
+    return record.known or ("running" if record.stamps else "waiting")
 
 
-def _rate(seen: Seen) -> float:
-    """Turns per second in the last report; reports come every 0.1 s."""
-    return len(seen.report["track"]) / 0.1 if seen.report else 0.0
+def _rate(record: AgentRecord) -> float:
+    """Turns per second in the last report."""
+    return len(record.report["track"]) / REPORT if record.report else 0.0

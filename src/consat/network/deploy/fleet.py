@@ -120,8 +120,11 @@ class Fleet:
         return agent in self._children and self._children[agent].process.poll() is None
 
     def exit_code(self, agent: str) -> int | None:
-        """The exit code of an agent's process; None while it runs, or if it was never started."""
-        return self._children[agent].process.poll() if agent in self._children else None
+        """The exit code of an agent's process. None if it was never started, and until it has ended and `poll` has read all its output."""
+        child = self._children.get(agent)
+        if child is None or any(key.data[1] is child for key in self._selector.get_map().values()):
+            return None
+        return child.process.poll()
 
     def pid(self, agent: str) -> int:
         """The process id of an agent."""

@@ -26,7 +26,7 @@ SAMPLE: Final = 0.05
 
 
 @dataclass
-class Seen:
+class AgentRecord:
     """The events of one agent so far.
 
     Attributes:
@@ -81,6 +81,11 @@ class Seen:
             case _:
                 return
 
+    def lose(self) -> None:
+        """Update for the end of its process: what it knew is lost with it."""
+        self.born = self.ended = None
+        self._learn(None, None, settled=False)
+
     def _learn(self, known: Knowledge, stamp: float | None, *, settled: bool) -> None:
         if known != self.known:
             self.known, self.known_from = known, stamp
@@ -113,25 +118,25 @@ class Observer:
         clock: unit of the stamps.
         present: ids of the agents that are present now.
         origin: stamp of t = 0. None if nothing depends on time; then time is counted from the first stamp.
-        seen: the events of each agent, by id.
+        records: the events of each agent, by id.
     """
 
     def __init__(self, team: Team, start: np.ndarray, clock: str) -> None:
         self.team, self.clock, self.present = team, clock, frozenset(team.ids)
         self.origin: float | None = None
-        self.seen = {agent: Seen() for agent in team.ids}
+        self.records = {agent: AgentRecord() for agent in team.ids}
         self._start = start
 
     def take(self, events: Sequence[Event]) -> None:
         """Update from events. Events of unknown agents are ignored."""
         for event in events:
-            if event.get("id") in self.seen:
-                self.seen[event["id"]].take(event)
+            if event.get("id") in self.records:
+                self.records[event["id"]].take(event)
 
     @property
-    def there(self) -> list[Seen]:
+    def there(self) -> list[AgentRecord]:
         """The records of the agents that are present."""
-        return [seen for agent, seen in self.seen.items() if agent in self.present]
+        return [record for agent, record in self.records.items() if agent in self.present]
 
     def all_known(self) -> tuple[Knowledge, float | None]:
         """What all agents know, and the stamp from which they know it; (None, None) if any agent knows nothing.
@@ -139,14 +144,14 @@ class Observer:
         Some agents may know that all agents they can hear of are satisfied, while others know that the team is infeasible. Then the result
         is ``infeasible``.
         """
-        known = [seen.known for seen in self.there]
+        known = [record.known for record in self.there]
         if None in known:
             return None, None
-        return "infeasible" if "infeasible" in known else "satisfied", max(seen.known_from or 0.0 for seen in self.there)
+        return "infeasible" if "infeasible" in known else "satisfied", max(record.known_from or 0.0 for record in self.there)
 
     def concluded(self) -> float | None:
         """The stamp from which all agents know the final outcome, or None."""
-        since = [seen.settled_from for seen in self.there]
+        since = [record.settled_from for record in self.there]
         return None if None in since else max(stamp for stamp in since if stamp is not None)
 
     def settled(self, window: float, distance: float) -> bool:
@@ -156,24 +161,25 @@ class Observer:
             window: length of the time to look back, in units of stamps.
             distance: motion up to this on each axis counts as none, length.
         """
-        if any(seen.report is None or not all(peer["up"] for peer in seen.report["peers"].values()) for seen in self.there):
+        if any(record.report is None or not all(peer["up"] for peer in record.report["peers"].values()) for record in self.there):
             return False
-        latest = min((seen.stamps[-1] if seen.stamps else -np.inf) for seen in self.there)
-        return all(seen.moved(latest - window) <= distance for seen in self.there)
+        latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in self.there)
+        return all(record.moved(latest - window) <= distance for record in self.there)
 
     def positions(self) -> np.ndarray:
         """(N, d) current positions of the bodies, length."""
-        return np.array([seen.places[-1] if seen.places else start for seen, start in zip(self.seen.values(), self._start, strict=True)])
+        return np.array(
+            [record.places[-1] if record.places else start for record, start in zip(self.records.values(), self._start, strict=True)]
+        )
 
     def network(self) -> dict[str, Any]:
         """Network measurements of the agents, for the summary: loss, round-trip time (s), messages, CPU time (s)."""
         links, agents = [], {}
-        for agent, seen in self.seen.items():
-            report = seen.report or {}
+        for agent, record in self.records.items():
+            report = record.report or {}
             links += list(report.get("peers", {}).values())
-            agents[agent] = {
-                "sent": dict(seen.sent), "dropped": report.get("dropped", {}), "cpu": None if seen.ended is None else seen.ended.get("cpu"),
-            }  # fmt: skip
+            cpu = None if record.ended is None else record.ended.get("cpu")
+            agents[agent] = {"sent": dict(record.sent), "dropped": report.get("dropped", {}), "cpu": cpu}
         trips = [link["trip"] for link in links if link["trip"] is not None]
         return {
             "loss": float(np.mean([link["loss"] for link in links])) if links else None,
@@ -185,7 +191,7 @@ class Observer:
     def trace(
         self, copies: Estimates, nu: Nu, ending: Ending, seconds: Mapping[str, float], stages: Sequence[Stage], tick: float
     ) -> Trace:  # fmt: skip
-        """The trace of the agents that are present at the end. A position holds until the next stamp.
+        """The trace of the agents that are present at the end. It begins at the start positions; a position holds until the next stamp.
 
         Args:
             copies: the estimates at the end: holders and positions held.
@@ -196,18 +202,22 @@ class Observer:
             tick: duration of a round, s.
         """
         begin = self._begin()
-        end = max([begin, *(seen.stamps[-1] for seen in self.seen.values() if seen.stamps)])
+        end = max([begin, *(record.stamps[-1] for record in self.records.values() if record.stamps)])
         if self.clock == "round":
             stamps = steps = np.arange(int(end) + 1, dtype=float)
         else:
             stamps = np.append(np.arange(begin, end, SAMPLE), end)
             steps = stamps - begin
-        position = np.stack([self._along(seen, row, stamps) for seen, row in zip(self.seen.values(), self._start, strict=True)], axis=1)
+        position = np.stack(
+            [self._along(record, row, stamps) for record, row in zip(self.records.values(), self._start, strict=True)], axis=1
+        )
+        if len(stamps) > 1:
+            position[0] = self._start  # the first stamp is that of a step, after which the body may be elsewhere
         dt = tick if self.clock == "round" else SAMPLE
         times = steps * (tick if self.clock == "round" else 1.0)
-        margins, smooth = _seen(stages, position, times, nu)
+        margins, smooth = _margins(stages, position, times, nu)
         final, there = stages[-1].there()
-        sent = sum((seen.sent for seen in self.seen.values()), Counter[str]())
+        sent = sum((record.sent for record in self.records.values()), Counter[str]())
         still = len(stages) == 1 and not final.moves
         margin, position = margins.min(axis=1), position[:, there]
         return Trace(
@@ -247,16 +257,16 @@ class Observer:
         """The stamp from which time is counted."""
         if self.origin is not None:
             return self.origin
-        return min((seen.stamps[0] for seen in self.seen.values() if seen.stamps), default=0.0)
+        return min((record.stamps[0] for record in self.records.values() if record.stamps), default=0.0)
 
-    def _along(self, seen: Seen, start: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-        order = np.argsort(seen.stamps, kind="stable")
-        known = np.array(seen.stamps, dtype=float)[order]
-        places = np.concatenate([start[None], np.array(seen.places, dtype=float).reshape(-1, len(start))[order]])
+    def _along(self, record: AgentRecord, start: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+        order = np.argsort(record.stamps, kind="stable")
+        known = np.array(record.stamps, dtype=float)[order]
+        places = np.concatenate([start[None], np.array(record.places, dtype=float).reshape(-1, len(start))[order]])
         return places[np.searchsorted(known, stamps, side="right")]
 
 
-def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: Nu) -> tuple[np.ndarray, np.ndarray]:
+def _margins(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: Nu) -> tuple[np.ndarray, np.ndarray]:
     """Margins by the constraints that were valid at each time.
 
     Args:
@@ -274,13 +284,13 @@ def _seen(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, nu: 
         rows = which == k
         team, there = stages[k].there()
         live = Live.of(team, 1.0, all_of_them=False)
-        found = _look(Objective.at_positions(team), live, on_device(position[:, there]), on_device(times), nu)
+        found = _margins_at(Objective.at_positions(team), live, on_device(position[:, there]), on_device(times), nu)
         margins[np.ix_(rows, there)], smooth[rows] = (np.asarray(each)[rows] for each in found)
     return margins, smooth
 
 
 @jax.jit
-def _look(observer: Objective, live: Live | None, position: jax.Array, times: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
+def _margins_at(observer: Objective, live: Live | None, position: jax.Array, times: jax.Array, nu: Nu) -> tuple[jax.Array, jax.Array]:
     """(T, N) ᾱ_i and (T,) β, compiled as one program. `live` gives the moving parameters; None if nothing moves."""
 
     def at(x: jax.Array, time: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -27,10 +27,10 @@ from consat.errors import InvalidInput, InvalidSettings, InvalidTeam
 from consat.faults import Faults
 from consat.network.deploy.output import Output
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
+from consat.network.node.commander import Commander
 from consat.network.node.core import Embodied, Moment
-from consat.network.node.helm import Helm
 from consat.network.node.membership import Membership
-from consat.network.node.modes import Manner, Runner, core_of, runner_of
+from consat.network.node.modes import NodeSettings, Runner, core_of, runner_of
 from consat.network.node.orders import Order, Orders, heeding_signals
 from consat.network.node.part import Part
 from consat.network.node.pilot import RobotBody
@@ -79,7 +79,7 @@ class ProcessOptions:
     standby: bool = False
 
 
-class Anew(NamedTuple):
+class Restart(NamedTuple):
     """The state with which an agent starts, or continues after it has reloaded its part.
 
     Attributes:
@@ -93,12 +93,12 @@ class Anew(NamedTuple):
     membership: Membership
 
 
-def run_agent(part: Part, manner: Manner, options: ProcessOptions, again: Callable[[], Part] | None = None) -> None:
+def run_agent(part: Part, settings: NodeSettings, options: ProcessOptions, again: Callable[[], Part] | None = None) -> None:
     """Run one agent until it is done or told to stop.
 
     Args:
         part: local problem of the agent.
-        manner: its mode and rate.
+        settings: its mode and rate.
         options: options of the process.
         again: reads the part from its file again; None if the part has no file.
 
@@ -113,23 +113,23 @@ def run_agent(part: Part, manner: Manner, options: ProcessOptions, again: Callab
     measured = _measured(part, options) if options.sensor == "stdin" else None
     body = SimulatedBody(_start(part, options), options.speed) if measured is None else measured
     reading = options.attached or measured is not None or options.standby
-    if part.team.moves and part.epoch is None and manner.mode != "lockstep" and not reading:
+    if part.team.moves and part.epoch is None and settings.mode != "lockstep" and not reading:
         raise InvalidSettings("constraints move with time, but nobody says when t = 0 is; say --epoch, to all agents the same")
     orders = Orders(None if measured is None else dimension, reading=reading)
     with Output() as output, heeding_signals(orders):
-        helm = Helm(part.me, dimension, measured, options.sensor_timeout, output.write)
-        core = core_of(part, manner)
+        commander = Commander(part.me, dimension, measured, options.sensor_timeout, output.write)
+        core = core_of(part, settings)
         _warm(core)
-        begin = Anew(part, core, Membership(part))
+        begin = Restart(part, core, Membership(part))
         told = _wait_to_join(begin, orders, again, output.write) if options.standby else begin
         end = math.inf if options.until is None else time.monotonic() + options.until
         try:
             with ThreadPoolExecutor(1) as reader:
-                own = _Own(body, orders, helm, again, reader, deque(), end, output.write)
-                while isinstance(told, Anew):
-                    told = _live(told, manner, options, own)
+                own = _Own(body, orders, commander, again, reader, deque(), end, output.write)
+                while isinstance(told, Restart):
+                    told = _live(told, settings, options, own)
         except BaseException:
-            helm.stand()
+            commander.halt()
             raise
 
 
@@ -139,7 +139,7 @@ class _Own(NamedTuple):
     Attributes:
         body: the body of the agent.
         orders: orders and measurements from stdin.
-        helm: sends velocity commands to the body.
+        commander: sends velocity commands to the body.
         again: reads the part from its file; None if the part has no file.
         reader: thread that reads and compiles a new part.
         reading: the reload order in progress, with its future result; at most one.
@@ -149,7 +149,7 @@ class _Own(NamedTuple):
 
     body: Body
     orders: Orders
-    helm: Helm
+    commander: Commander
     again: Callable[[], Part] | None
     reader: Executor
     reading: deque[tuple[Order, Future[tuple[Part, Embodied] | str]]]
@@ -157,42 +157,42 @@ class _Own(NamedTuple):
     write: Callable[[dict[str, Any]], None]
 
 
-def _live(begin: Anew, manner: Manner, options: ProcessOptions, own: _Own) -> Anew | str:
+def _live(begin: Restart, settings: NodeSettings, options: ProcessOptions, own: _Own) -> Restart | str:
     """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
     part = begin.part
-    with _transport(part, manner, options) as transport:
+    with _transport(part, settings, options) as transport:
         runner = runner_of(
-            part, manner, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=own.write,
+            part, settings, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=own.write,
             core=begin.core,
         )  # fmt: skip
         station = runner.station
         station.membership.adopt(begin.membership)
-        station.log("start", mode=manner.mode, run=part.run, pid=os.getpid(), rounds=manner.mode == "lockstep")
+        station.log("start", mode=settings.mode, run=part.run, pid=os.getpid(), rounds=settings.mode == "lockstep")
         try:
             told = _loop(runner, transport, own, options)
         except BaseException:
-            own.helm.stand()  # before the transport is closed, which may take long
+            own.commander.halt()  # before the transport is closed, which may take long
             raise
         if isinstance(told, str):
-            own.helm.stand()
-            station.goodbye()
+            own.commander.halt()
+            station.send_goodbye()
         station.report()
         if isinstance(told, str):
             station.log("end", why=told, cpu=round(time.process_time(), 3))
         return told
 
 
-def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptions) -> Anew | str:
-    station, orders, helm = runner.station, own.orders, own.helm
+def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptions) -> Restart | str:
+    station, orders, commander = runner.station, own.orders, own.commander
     known_since = math.inf
     while True:
-        helm.sense(orders)
+        commander.sense(orders)
         due = runner.step()
         now = time.monotonic()
-        helm.sense(orders)  # measurements that arrived during the step
-        helm.steer(station.target)
-        if (anew := _obey(runner, own)) is not None:
-            return anew
+        commander.sense(orders)  # measurements that arrived during the step
+        commander.steer(station.target)
+        if (restart := _obey(runner, own)) is not None:
+            return restart
         known_since = min(known_since, now) if station.settled else math.inf
         if runner.done:
             return "done"
@@ -205,7 +205,7 @@ def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptio
         transport.wait(min(max(due - now, 0.0), NAP))
 
 
-def _obey(runner: Runner, own: _Own) -> Anew | None:
+def _obey(runner: Runner, own: _Own) -> Restart | None:
     """Carry out the orders from stdin and log those that are rejected. Returns the state to continue with once a reload is done.
 
     A new part is read and compiled in a separate thread. Meanwhile the agent continues as before, and later orders wait.
@@ -222,7 +222,7 @@ def _obey(runner: Runner, own: _Own) -> Anew | None:
             station.log("rejected", line=order.line, why=refusal)
     if orders.leaving:
         orders.leaving = False
-        own.helm.stand()
+        own.commander.halt()
         station.log("leaving")
         runner.leave()
     if own.reading and own.reading[0][1].done():
@@ -233,11 +233,15 @@ def _obey(runner: Runner, own: _Own) -> Anew | None:
     return None
 
 
-def _carried(station: Station, part: Part, core: Embodied) -> Anew:
-    """The state after a reload, starting from the current estimates."""
+def _carried(station: Station, part: Part, core: Embodied) -> Restart:
+    """The state after a reload, starting from the current estimates. New copies start at the agent's estimate of its own position, as in
+    `consat.protocols.estimates.Estimates.carried`."""
     known = station.estimates
-    first = [known.get(agent, row) for agent, row in zip(part.team.ids, part.first, strict=True)]
-    return Anew(replace(part, first=np.array(first), epoch=station.epoch if part.epoch is None else part.epoch), core, station.membership)
+    own = known.get(part.me)
+    first = [known.get(agent, row if own is None else own) for agent, row in zip(part.team.ids, part.first, strict=True)]
+    return Restart(
+        replace(part, first=np.array(first), epoch=station.epoch if part.epoch is None else part.epoch), core, station.membership
+    )
 
 
 def _renewed(before: Part, core: Embodied, again: Callable[[], Part] | None) -> tuple[Part, Embodied] | str:
@@ -281,8 +285,8 @@ def _heed(runner: Runner, order: Order) -> str | None:
 
 
 def _wait_to_join(
-    begin: Anew, orders: Orders, again: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
-) -> Anew | str:  # fmt: skip
+    begin: Restart, orders: Orders, again: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
+) -> Restart | str:  # fmt: skip
     """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
     part, core = begin.part, begin.core
 
@@ -296,7 +300,7 @@ def _wait_to_join(
         while (order := orders.next()) is not None:
             told: Any = "the agent has not joined yet"
             if order.command == "join":
-                return Anew(part, core, Membership(part))
+                return Restart(part, core, Membership(part))
             if order.command == "clock":
                 told, part = None, replace(part, epoch=float(order.given["epoch"]))
             elif order.command == "reload":
@@ -314,8 +318,8 @@ def _wait_to_join(
 def _warm(core: Embodied) -> None:
     """Compile the core by running one turn, so that no neighbour waits for the compilation later."""
     moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
-    _, _, look = core.turn(core.begin(core.part.first), *core.empty(), moment)
-    core.margin(look.bodies)
+    _, _, view = core.turn(core.begin(core.part.first), *core.empty(), moment)
+    core.margin(view.bodies)
 
 
 def _measured(part: Part, options: ProcessOptions) -> MeasuredBody:
@@ -333,14 +337,14 @@ def _start(part: Part, options: ProcessOptions) -> np.ndarray:
 
 
 @contextmanager
-def _transport(part: Part, manner: Manner, options: ProcessOptions) -> Iterator[Transport]:
+def _transport(part: Part, settings: NodeSettings, options: ProcessOptions) -> Iterator[Transport]:
     from consat.network import keys
     from consat.network.transports.zenoh import connect
 
     credentials = None if options.keys is None else keys.load(options.keys, part.me)
     listen, *others = (_protected(address) if credentials else address for address in (part.listen, *(n.address for n in part.neighbours)))
     addresses = {neighbour.id: address for neighbour, address in zip(part.neighbours, others, strict=True)}
-    transport = connect(part.run, part.me, listen, addresses, reliable=manner.reliable, credentials=credentials)
+    transport = connect(part.run, part.me, listen, addresses, reliable=settings.reliable, credentials=credentials)
     try:
         if options.faults.on_messages:
             yield FaultyTransport(transport, time.monotonic, options.faults)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from consat.network.node.body import SimulatedBody
-from consat.network.node.modes import Manner, Runner, runner_of
+from consat.network.node.modes import NodeSettings, Runner, runner_of
 from consat.network.node.part import Part
 from consat.network.transports.memory import MemoryNetwork
 
@@ -28,7 +28,7 @@ class Rehearsal:
 
     Args:
         parts: the part (local problem) of each agent, by id.
-        manner: mode and rate of the agents.
+        settings: mode and rate of the agents.
         network: the simulated network.
         speed: largest speed of a body, length/s.
         build: makes the runner of an agent; by default as a process does.
@@ -38,14 +38,14 @@ class Rehearsal:
     def __init__(
         self,
         parts: Mapping[str, Part],
-        manner: Manner,
+        settings: NodeSettings,
         network: MemoryNetwork,
         *,
         speed: float = np.inf,
         build: Callable[..., Runner] = runner_of,
         skew: Mapping[str, float] | None = None,
     ) -> None:
-        self.parts, self.manner, self.network = parts, manner, network
+        self.parts, self.settings, self.network = parts, settings, network
         self.events: list[dict[str, Any]] = []
         self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
@@ -58,15 +58,15 @@ class Rehearsal:
 
         Args:
             *agents: ids of the agents; all if none is given.
-            **changes: fields of `Manner` to change for these agents.
+            **changes: fields of `NodeSettings` to change for these agents.
         """
         for agent in agents or tuple(self.parts):
             part = self.parts[agent]
             self._incarnations[agent] += 1
-            manner = Manner(**({field: getattr(self.manner, field) for field in self.manner.__dataclass_fields__} | changes))
+            settings = NodeSettings(**({field: getattr(self.settings, field) for field in self.settings.__dataclass_fields__} | changes))
             with jax.enable_x64(True):
                 self.runners[agent] = self._build(
-                    part, manner, self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
+                    part, settings, self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
                     clock=self.network.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
                     wall=functools.partial(self._wall, self._skew.get(agent, 0.0)),
                 )  # fmt: skip

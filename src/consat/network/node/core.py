@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from consat.network.node.part import Part
-from consat.network.node.problem import Alone, ends, live_of
+from consat.network.node.problem import OwnSolver, ends, live_of
 from consat.network.wire import Numbers
 from consat.numerics import quick_compilation
 from consat.protocols import Known, Rounds, agreement
@@ -55,7 +55,7 @@ class Moment(NamedTuple):
     time: float = 0.0
 
 
-class Look(NamedTuple):
+class AgentView(NamedTuple):
     """What an agent sees of itself after a turn.
 
     Attributes:
@@ -89,19 +89,19 @@ class Rows(NamedTuple):
     pair: np.ndarray
 
 
-class Turned(NamedTuple):
+class StepResult(NamedTuple):
     """What comes of a turn of a protocol.
 
     Attributes:
         state: the next.
-        said: what to say.
+        outbox: what to send.
         x: (rows, d) the estimates.
-        bound: see `Look`.
-        least: see `Look`.
+        bound: see `AgentView`.
+        least: see `AgentView`.
     """
 
     state: Any
-    said: Rows
+    outbox: Rows
     x: np.ndarray
     bound: float = np.inf
     least: float = -np.inf
@@ -131,12 +131,12 @@ class Core(Protocol):
         ...
 
     @property
-    def letters(self) -> Mapping[str, Numbers]:
+    def pair_numbers(self) -> Mapping[str, Numbers]:
         """What it says to each neighbour besides, whoever is there."""
         ...
 
     @property
-    def solver(self) -> Alone:
+    def solver(self) -> OwnSolver:
         """Of the part."""
         ...
 
@@ -144,7 +144,7 @@ class Core(Protocol):
         """The state from first estimates, (rows, d), at a time of the shared clock, s."""
         ...
 
-    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         """Hear what arrived, where `arrived`, (E,) and (G,), and take a step."""
         ...
 
@@ -156,7 +156,7 @@ class Core(Protocol):
         """The state that `state` of an `other` core becomes in this one; what is new begins from `first`, (rows, d)."""
         ...
 
-    def anew(self, state: Any) -> Any:
+    def without_proofs(self, state: Any) -> Any:
         """The state when constraints have changed: what was proven with others holds no more."""
         ...
 
@@ -172,14 +172,14 @@ def adjusted(core: _Any, whole: Part) -> _Any:
     return other
 
 
-class Kept(NamedTuple):
+class IndexMap(NamedTuple):
     """Which rows and ends of another core live on: the index there, −1 where new."""
 
     row: np.ndarray
     link: np.ndarray
 
     @classmethod
-    def of(cls, new: Core | Embodied, old: Core | Embodied) -> Kept:
+    def of(cls, new: Core | Embodied, old: Core | Embodied) -> IndexMap:
         rows = {agent: k for k, agent in enumerate(old.part.team.ids)}
         links = {end: k for k, end in enumerate(old.ends)}
         return cls(
@@ -202,12 +202,12 @@ def _take(index: np.ndarray, old: Array, fresh: Array) -> Array:
     return jnp.where(kept, jnp.asarray(old)[np.maximum(index, 0)], fresh)
 
 
-def no_letters(whole: Part) -> Mapping[str, Numbers]:
+def no_pair_numbers(whole: Part) -> Mapping[str, Numbers]:
     """Of a protocol that speaks for each end of a link only."""
     return {neighbour.id: Numbers((0,)) for neighbour in whole.neighbours}
 
 
-class _Now(NamedTuple):
+class _RoundState(NamedTuple):
     state: Any
     ages: agreement.Ages
 
@@ -220,39 +220,39 @@ class RoundCore:
         self.whole = whole
         self.part = whole.without(gone)
         self.ends = ends(self.part)
-        self.solver = Alone.of(self.part)
+        self.solver = OwnSolver.of(self.part)
         self._begin, self._turn, *_ = _compiled()
         self.layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self.layout.sizes) + 1
         # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
         single = PENALTY / whole.length**2 if protocol.name == "admm" else np.inf
         self.largest = np.array([*(LARGEST if shape else single for shape, size in self.layout.each for _ in range(size)), LARGEST])
-        self.letters = no_letters(whole)
+        self.pair_numbers = no_pair_numbers(whole)
 
-    def begin(self, first: np.ndarray, time: float = 0.0) -> _Now:
+    def begin(self, first: np.ndarray, time: float = 0.0) -> _RoundState:
         return self._begin(self.protocol, self.solver, first, time)
 
-    def turn(self, state: _Now, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+    def turn(self, state: _RoundState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         heard = inbox.link, arrived.link, moment.fresh
         now, outbox = self._turn(self.protocol, self.layout, self.solver, state, heard, (moment.round, moment.margin, moment.time))
-        return Turned(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
+        return StepResult(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
 
     def among(self, gone: Collection[str], whole: Part | None = None) -> RoundCore:
         return RoundCore(self.protocol, whole or self.whole, gone)
 
-    def anew(self, state: _Now) -> _Now:
+    def without_proofs(self, state: _RoundState) -> _RoundState:
         """Nothing is proven in it; that constraints hold is counted afresh in every turn."""
         return state
 
-    def carry(self, other: Core, state: _Now, first: np.ndarray, time: float = 0.0) -> _Now:
+    def carry(self, other: Core, state: _RoundState, first: np.ndarray, time: float = 0.0) -> _RoundState:
         """Only the estimates live on: the rest has settled on a problem that is no more, what is known of its satisfaction included."""
-        return self.begin(np.asarray(Kept.of(self, other).merge("row", state.state.x, first)), time)
+        return self.begin(np.asarray(IndexMap.of(self, other).merge("row", state.state.x, first)), time)
 
 
 class _Outline:
     """A solver that gives what a true one gives, but for the values: enough to find the shape of a message, and quick to trace."""
 
-    def __init__(self, solver: Alone) -> None:
+    def __init__(self, solver: OwnSolver) -> None:
         self.links, self.length, self.hops, self.convex = solver.links, solver.length, solver.hops, solver.convex
         self.to_rows, self.least, self.interior = solver.to_rows, solver.least, solver.interior
 
@@ -276,7 +276,7 @@ class _Layout(NamedTuple):
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, protocol: Rounds, solver: Alone, dimension: int) -> _Layout:
+    def of(cls, protocol: Rounds, solver: OwnSolver, dimension: int) -> _Layout:
         """Found by tracing, not by running."""
         first, outline = jax.ShapeDtypeStruct((len(solver.holder), dimension), float), _Outline(solver)
 
@@ -305,14 +305,19 @@ class _Layout(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def _begin(protocol: Rounds, solver: Alone, first: Array, time: Array) -> _Now:
+def _begin(protocol: Rounds, solver: OwnSolver, first: Array, time: Array) -> _RoundState:
     solver = solver.at(time)
-    return _Now(protocol.start(first, solver), agreement.start(first, solver))
+    return _RoundState(protocol.start(first, solver), agreement.start(first, solver))
 
 
 def _turn(
-    protocol: Rounds, layout: _Layout, solver: Alone, now: _Now, heard: tuple[Array, Array, Array], moment: tuple[Array, Array, Array]
-) -> tuple[_Now, Array]:
+    protocol: Rounds,
+    layout: _Layout,
+    solver: OwnSolver,
+    now: _RoundState,
+    heard: tuple[Array, Array, Array],
+    moment: tuple[Array, Array, Array],
+) -> tuple[_RoundState, Array]:
     inbox, arrived, fresh = heard
     round_, margin, time = moment
     solver = solver.at(time)
@@ -325,7 +330,7 @@ def _turn(
         [*(leaf.reshape(len(inbox), size) for leaf, size in zip(jax.tree.leaves(message), layout.sizes, strict=True)), told[:, None]],
         axis=1,
     )
-    return _Now(state, ages), outbox
+    return _RoundState(state, ages), outbox
 
 
 def known_of(ages: agreement.Ages, fresh: Array | np.ndarray) -> agreement.Ages:
@@ -361,7 +366,7 @@ class Embodied:
         dimension = self.part.team.dimension
         self.width = core.width + dimension + 2
         self.largest = np.append(core.largest, np.full(dimension + 2, LARGEST))
-        self.letters = core.letters
+        self.pair_numbers = core.pair_numbers
         self.ages = (*([core.width - 1] if core.width else []), self.width - 1)
         """Columns of the rows that say for how many rounds something has held."""
         self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
@@ -370,7 +375,7 @@ class Embodied:
         """The state from first estimates, (rows, d), at a time of the shared clock, s."""
         return EmbodiedState(self.core.begin(first, time), self._start(self.core.solver, first))
 
-    def turn(self, state: EmbodiedState, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[EmbodiedState, Rows, Look]:
+    def turn(self, state: EmbodiedState, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[EmbodiedState, Rows, AgentView]:
         """See `Core.turn`; and what the agent then sees of itself."""
         width = self.core.width
         bodies, said, sight = self._agree(
@@ -380,14 +385,14 @@ class Embodied:
         moment = moment._replace(margin=float(margin))
         inner = self.core.turn(state.core, Rows(inbox.link[:, :width], inbox.pair), arrived, moment)
         proven = near(inner.bound, inner.least, self.part.psi)
-        look = Look(inner.x, np.asarray(bodies.position), bool(heard), float(known), inner.bound, inner.least, proven)
-        link = np.concatenate([inner.said.link, np.asarray(said)], axis=1)
-        return EmbodiedState(inner.state, bodies), Rows(link, inner.said.pair), look
+        view = AgentView(inner.x, np.asarray(bodies.position), bool(heard), float(known), inner.bound, inner.least, proven)
+        link = np.concatenate([inner.outbox.link, np.asarray(said)], axis=1)
+        return EmbodiedState(inner.state, bodies), Rows(link, inner.outbox.pair), view
 
     def empty(self) -> tuple[Rows, Rows]:
         """Nothing has come: an inbox, and what in it has arrived."""
         neighbours = [neighbour.id for neighbour in self.part.neighbours]
-        longest = max((self.letters[neighbour].shape[0] for neighbour in neighbours), default=0)
+        longest = max((self.pair_numbers[neighbour].shape[0] for neighbour in neighbours), default=0)
         inbox = Rows(np.zeros((len(self.ends), self.width)), np.zeros((len(neighbours), longest)))
         return inbox, Rows(*(np.zeros(len(rows), dtype=bool) for rows in inbox))
 
@@ -403,14 +408,14 @@ class Embodied:
         """See `adjusted`."""
         return Embodied(adjusted(self.core, whole))
 
-    def anew(self, state: EmbodiedState) -> EmbodiedState:
-        """See `Core.anew`."""
-        return state._replace(core=self.core.anew(state.core))
+    def without_proofs(self, state: EmbodiedState) -> EmbodiedState:
+        """See `Core.without_proofs`."""
+        return state._replace(core=self.core.without_proofs(state.core))
 
     def carry(self, other: Embodied, state: EmbodiedState, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
         """See `Core.carry`. Where bodies are lives on; who is satisfied does not."""
         fresh = self._start(self.core.solver, first)
-        bodies = Kept.of(self, other).merge(_PER_BODIES, state.bodies, fresh)._replace(ages=fresh.ages)
+        bodies = IndexMap.of(self, other).merge(_PER_BODIES, state.bodies, fresh)._replace(ages=fresh.ages)
         return EmbodiedState(self.core.carry(other.core, state.core, first, time), bodies)
 
 
@@ -423,7 +428,7 @@ def owners_of(part: Part) -> agreement.Owners:
 
 
 def _agree(
-    solver: Alone, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array,
+    solver: OwnSolver, owners: agreement.Owners, bodies: agreement.Bodies, heard: tuple[Array, Array, Array], body: Array,
     time: Array,
 ) -> tuple[agreement.Bodies, Array, tuple[Array, Array, Array]]:  # fmt: skip
     solver = solver.at(time)
@@ -449,10 +454,10 @@ def _compiled() -> _Programs:
     """Compiled once for all agents of the same shape."""
     options = quick_compilation()
 
-    def start(solver: Alone, first: Array) -> agreement.Bodies:
+    def start(solver: OwnSolver, first: Array) -> agreement.Bodies:
         return agreement.start_bodies(first, solver)
 
-    def margin(solver: Alone, positions: Array, time: Array) -> Array:
+    def margin(solver: OwnSolver, positions: Array, time: Array) -> Array:
         return solver.at(time).margin(positions)
 
     return _Programs(

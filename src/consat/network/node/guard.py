@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from consat.network.node.core import Embodied, Look, Moment, Rows
+from consat.network.node.core import AgentView, Embodied, Moment, Rows
 
 
 class Turn(NamedTuple):
@@ -22,16 +22,16 @@ class Turn(NamedTuple):
     Attributes:
         state: the next state.
         outbox: messages to send.
-        look: what the agent knows after the step.
+        view: what the agent knows after the step.
         refused: neighbours whose messages were not used.
-        anew: whether the agent restarted from its initial estimates.
+        restarted: whether the agent restarted from its initial estimates.
     """
 
     state: Any
     outbox: Rows
-    look: Look
+    view: AgentView
     refused: tuple[str, ...] = ()
-    anew: bool = False
+    restarted: bool = False
 
 
 def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> Turn:
@@ -52,7 +52,7 @@ def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment)
     if _sound(state, rest):
         return rest
     fresh = core.begin(core.part.first, moment.time)
-    return Turn(*core.turn(fresh, *_only(core, inbox, arrived, set()), moment), refused=tuple(refused), anew=True)
+    return Turn(*core.turn(fresh, *_only(core, inbox, arrived, set()), moment), refused=tuple(refused), restarted=True)
 
 
 def _of(core: Embodied, arrived: Rows, neighbours: Collection[str]) -> Rows:
@@ -70,7 +70,7 @@ def _only(core: Embodied, inbox: Rows, arrived: Rows, neighbours: Collection[str
 def _sound(before: Any, after: Turn) -> bool:
     """Whether the step was valid: no entry has become NaN, and no position or array of vectors has become infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after.state), strict=True)
-    return bool(np.isfinite(after.look.x).all()) and all(_kept(np.asarray(old), np.asarray(new)) for old, new in pairs)
+    return bool(np.isfinite(after.view.x).all()) and all(_kept(np.asarray(old), np.asarray(new)) for old, new in pairs)
 
 
 def _kept(old: np.ndarray, new: np.ndarray) -> bool:

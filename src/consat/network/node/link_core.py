@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.network.node.core import LARGEST, Core, Kept, Moment, Rows, Turned, no_letters
+from consat.network.node.core import LARGEST, Core, IndexMap, Moment, Rows, StepResult, no_pair_numbers
 from consat.network.node.part import Part
-from consat.network.node.problem import Alone, ends
+from consat.network.node.problem import OwnSolver, ends
 from consat.numerics import quick_compilation
 from consat.protocols.local.proximal import Memory
 
@@ -79,33 +79,33 @@ class LinkCore:
         self.whole, self.k1, self.k2 = whole, k1, k2
         self.part = whole.without(gone)
         self.ends = ends(self.part)
-        self.solver = Alone.of(self.part)
+        self.solver = OwnSolver.of(self.part)
         self.width = 2 * self.part.team.dimension + 1
         self.largest = np.full(self.width, LARGEST)
-        self.letters = no_letters(whole)
+        self.pair_numbers = no_pair_numbers(whole)
         self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> LinkState:
         return self._begin(self.solver, first, time)
 
-    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+    def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
         state, outbox = self._turn(self.solver, gains, state, inbox.link, arrived.link, moment)
-        return Turned(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
+        return StepResult(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
 
     def among(self, gone: Collection[str], whole: Part | None = None) -> LinkCore:
         return LinkCore(whole or self.whole, self.k1, self.k2, gone)
 
-    def anew(self, state: LinkState) -> LinkState:
+    def without_proofs(self, state: LinkState) -> LinkState:
         """The state unchanged: it contains no proofs."""
         return state
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray, time: float = 0.0) -> LinkState:
         """Initial state with the old values at the ends of links that remain."""
-        return Kept.of(self, other).merge(_PER, state, self.begin(first, time))
+        return IndexMap.of(self, other).merge(_PER, state, self.begin(first, time))
 
 
-def _begin(solver: Alone, first: Array, time: Array) -> LinkState:
+def _begin(solver: OwnSolver, first: Array, time: Array) -> LinkState:
     solver = solver.at(time)
     there = solver.links.at(first)
     nothing = jnp.zeros(len(there))
@@ -117,7 +117,7 @@ def _begin(solver: Alone, first: Array, time: Array) -> LinkState:
 
 
 def _turn(
-    solver: Alone, gains: tuple[Array, Array], state: LinkState, inbox: Array, arrived: Array, moment: Moment
+    solver: OwnSolver, gains: tuple[Array, Array], state: LinkState, inbox: Array, arrived: Array, moment: Moment
 ) -> tuple[LinkState, Array]:
     solver = solver.at(moment.time)
     state = _hear(solver, state, inbox, arrived)
@@ -136,7 +136,7 @@ def _turn(
     return state, jnp.concatenate([links.at(x), force, state.adopted[:, None]], axis=1)
 
 
-def _hear(solver: Alone, state: LinkState, inbox: Array, arrived: Array) -> LinkState:
+def _hear(solver: OwnSolver, state: LinkState, inbox: Array, arrived: Array) -> LinkState:
     """Store the received messages. An agent without a valid λ adopts −λ̂ of the neighbour, and the neighbour's estimates of other positions.
     If neither has a valid λ, it stays 0."""
     d = state.x.shape[1]

@@ -18,7 +18,7 @@ import numpy as np
 
 from consat.errors import InvalidSettings
 from consat.network.node.core import Moment, Rows
-from consat.network.node.paced import FAREWELLS
+from consat.network.node.fixed_rate import FAREWELLS
 from consat.network.node.persistence import Store
 from consat.network.node.station import SILENT, Station
 from consat.network.wire import SUPPORT, Kind
@@ -50,12 +50,12 @@ class Lockstep:
         self._tick = 1.0 / (rate or ROUNDS_A_SECOND)  # s per round for schedules, as in a single process
         self._round = 0  # number of rounds computed and sent
         self._regrouped = 0  # `_round` at the last change of membership, from which a protocol counts its rounds
-        self._said: dict[str, list[np.ndarray]] = {}
+        self._message: dict[str, list[np.ndarray]] = {}
         self._blocks: dict[str, dict[int, Sequence[np.ndarray]]] = {neighbour: {} for neighbour in station.peers.all}
         self._rumours: dict[str, tuple[int, int]] = {}
         self._reached: dict[str, int] = {}
         self._lacking: set[str] = set()
-        self._spoke = -np.inf
+        self._sent_at = -np.inf
         self._patience = self._usual = RESEND
         self._began = -np.inf
         self._farewells = 0
@@ -76,15 +76,15 @@ class Lockstep:
     def step(self) -> float:
         """See `Runner.step`."""
         station = self.station
-        self._hear()
+        self._receive()
         now = station.clock()
         if self._farewells:
-            if now - self._spoke >= RESEND:
-                self._spoke = now
+            if now - self._sent_at >= RESEND:
+                self._sent_at = now
                 self._farewells -= 1
                 self.done = self._farewells == 0
-                station.greet()
-            return self._spoke + RESEND
+                station.send_hello()
+            return self._sent_at + RESEND
         if self._state is None and station.body.position() is not None:
             self._state = station.core.begin(station.among(station.first()))
         if self._state is not None:
@@ -93,17 +93,17 @@ class Lockstep:
             self._catch_up()
             if self._ready() and now - self._began >= self._period:
                 self._turn(now)
-            elif now - self._spoke >= self._patience:
+            elif now - self._sent_at >= self._patience:
                 self._repeat(now)
         if not self._over() and now - self._began > max(SILENT, 3.0 * self._period):  # knowledge expires while the agent waits
             station.conclude(float(self._round), lately=False)
         due = station.watch()
         if self._ready() and self._state is not None:
             return min(due, self._began + self._period)
-        return min(due, self._spoke + self._patience)
+        return min(due, self._sent_at + self._patience)
 
-    def _hear(self) -> None:
-        for message in self.station.hear():
+    def _receive(self) -> None:
+        for message in self.station.receive():
             if message.kind is Kind.HELLO:
                 self._lacking.add(message.source)
             elif message.kind is Kind.STATE:
@@ -163,18 +163,18 @@ class Lockstep:
         inbox, arrived = station.empty()
         for neighbour in station.present if self._round else ():  # no messages before the first round
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
-                station.sort(neighbour, block, inbox, arrived)
+                station.deliver(neighbour, block, inbox, arrived)
         moment = self._moment(self._round - self._regrouped)
-        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
-        outbox, told = station.sift(outbox)
+        self._state, outbox, view = station.turn(self._state, inbox, arrived, moment)
+        outbox, told = station.filter(outbox)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
         self._usual = min(now - self._began, 1.05 * self._usual, SELDOM)
         self._patience = max(RESEND, min(USUAL * self._usual, SELDOM))
         self._began = now
         self._save()
-        self._speak(now, told)
-        station.move(look, float(self._round))
+        self._send(now, told)
+        station.move(view, float(self._round))
         if self._over():
             station.log("finished", round=self._round)
             station.report()
@@ -185,30 +185,30 @@ class Lockstep:
         time = (self._round + 1.0) * self._tick
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
-    def _speak(self, now: float, among: AbstractSet[str] | None = None) -> None:
+    def _send(self, now: float, among: AbstractSet[str] | None = None) -> None:
         """Say what there is to say of this round; that nothing is new to those who are not `among` some."""
         station = self.station
         assert self._outbox is not None
         current, previous = (station.blocks(outbox) for outbox in self._outbox)
         number = np.array([self._round - 1.0])
-        self._said = {neighbour: [*told, *previous[neighbour], number] for neighbour, told in current.items()}
+        self._message = {neighbour: [*told, *previous[neighbour], number] for neighbour, told in current.items()}
         self._lacking.clear()
-        self._spoke = now
-        station.say(self._said, among=among)
+        self._sent_at = now
+        station.send(self._message, among=among)
         if among is not None:
-            station.say_same(number, station.silent(among))
+            station.send_same(number, station.silent(among))
 
     def _repeat(self, now: float) -> None:
         """Repeat the last message: to all neighbours while waiting, and after the last round to those that lack it."""
         station = self.station
         to = [neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking]
-        self._spoke = now
+        self._sent_at = now
         self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
-        if self._said and to:
-            station.say(self._said, to)
-        elif not self._said:
-            station.greet()
+        if self._message and to:
+            station.send(self._message, to)
+        elif not self._message:
+            station.send_hello()
 
     def _regroup(self) -> None:
         station = self.station
@@ -224,10 +224,10 @@ class Lockstep:
         else:  # an agent has joined, or messages per neighbour refer to the old membership: compute new messages
             inbox, nothing = station.empty()
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
-            outbox, _ = station.sift(outbox)
+            outbox, _ = station.filter(outbox)
             self._outbox = outbox, outbox
         self._save()
-        self._speak(station.clock())
+        self._send(station.clock())
 
     def _among(self, rows: list[int], said: Rows) -> Rows:
         """The rows of messages to neighbours that remain, for protocols without messages per neighbour."""
@@ -239,7 +239,7 @@ class Lockstep:
         """Largest size of the stored record, in bytes: that with all agents present."""
         everyone = self.station.core.among(frozenset())
         state = everyone.begin(self.station.part.first)
-        longest = max((letter.shape[0] for letter in everyone.letters.values()), default=0)
+        longest = max((numbers.shape[0] for numbers in everyone.pair_numbers.values()), default=0)
         said = len(everyone.ends) * everyone.width + len(everyone.part.neighbours) * longest
         numbers = sum(np.size(leaf) for leaf in jax.tree.leaves(state)) + 2 * said
         return 8 * (numbers + self.station.part.team.count + 1)
@@ -279,4 +279,4 @@ class Lockstep:
         self._state = read(station.core.begin(station.among(station.part.first)))
         station.resume(self._outbox[0], self._state)
         station.log("resumed", round=self._round)
-        self._speak(station.clock())
+        self._send(station.clock())

@@ -39,7 +39,7 @@ class Membership:
         """The membership numbers of some agents."""
         return np.array([self._epoch[agent] for agent in agents], dtype=float)
 
-    def hear(self, agents: Iterable[str], epochs: np.ndarray) -> bool:
+    def update(self, agents: Iterable[str], epochs: np.ndarray) -> bool:
         """Update the numbers with those of a neighbour. Returns whether the number of another agent has changed.
 
         If the neighbour reports this agent as absent, it raises its own number, which contradicts the report.

@@ -13,9 +13,9 @@ import numpy as np
 from consat.errors import InvalidSettings
 from consat.network.node.body import Body
 from consat.network.node.core import Embodied, RoundCore
+from consat.network.node.fixed_rate import FixedRate
 from consat.network.node.link_core import LinkCore
 from consat.network.node.lockstep import Lockstep
-from consat.network.node.paced import Paced
 from consat.network.node.pair_core import PairCore
 from consat.network.node.part import RUNS, Part
 from consat.network.node.station import REPORT, Log, Station
@@ -32,7 +32,7 @@ HEARTBEAT: Final = 0.08
 
 
 @dataclass(frozen=True)
-class Manner:
+class NodeSettings:
     """Settings of a runner.
 
     Attributes:
@@ -146,20 +146,20 @@ def mode_for(kind: str | None) -> Mode:
     return "admm" if kind == "admm" else DEFAULT_MODE
 
 
-def core_of(part: Part, manner: Manner) -> Embodied:
+def core_of(part: Part, settings: NodeSettings) -> Embodied:
     """Build the core of the agent: the protocol compiled for it."""
     asked = part.settings.protocol
-    kind = protocol_of(manner.mode, asked.kind)
-    if manner.mode == "link":
+    kind = protocol_of(settings.mode, asked.kind)
+    if settings.mode == "link":
         gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
-        return Embodied(LinkCore(part, gains["k1"] * manner.pace, gains["k2"] * manner.pace))
+        return Embodied(LinkCore(part, gains["k1"] * settings.pace, gains["k2"] * settings.pace))
     protocol = with_gains(ROUNDS[kind](), asked)
     return Embodied(PairCore(protocol, part) if kind in PAIRED else RoundCore(protocol, part))
 
 
 def runner_of(
     part: Part,
-    manner: Manner,
+    settings: NodeSettings,
     transport: Transport,
     *,
     clock: Callable[[], float],
@@ -173,7 +173,7 @@ def runner_of(
 
     Args:
         part: the agent's part.
-        manner: settings of the runner.
+        settings: settings of the runner.
         transport: transport of the messages.
         clock: the agent's clock, s.
         incarnation: a number that is larger after each restart of the agent.
@@ -182,11 +182,11 @@ def runner_of(
         core: result of `core_of`, if it was computed before.
         wall: Unix time, s.
     """
-    lockstep = manner.mode == "lockstep"
+    lockstep = settings.mode == "lockstep"
     station = Station(
-        part, core or core_of(part, manner), manner.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
-        frames=2 if lockstep else 1, stamped=lockstep, beat=manner.beat, give_up=manner.give_up, report=manner.report, wall=wall,
+        part, core or core_of(part, settings), settings.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
+        frames=2 if lockstep else 1, stamped=lockstep, beat=settings.beat, give_up=settings.give_up, report=settings.report, wall=wall,
     )  # fmt: skip
     if lockstep:
-        return Lockstep(station, turns=manner.turns, rate=manner.rate, memory=manner.memory)
-    return Paced(station, manner.rate or RATE[manner.mode], manner.turns)
+        return Lockstep(station, turns=settings.turns, rate=settings.rate, memory=settings.memory)
+    return FixedRate(station, settings.rate or RATE[settings.mode], settings.turns)

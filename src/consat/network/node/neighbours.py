@@ -26,7 +26,6 @@ class Peer:
         sequence: sequence number of the last message sent to the neighbour.
         last: the last message accepted from the neighbour.
         heard: time of that message; −∞ before the first.
-        said: time of the last message sent to the neighbour.
         trip: running mean of the round-trip time, s; NaN before the first measurement.
         lost: running mean of the fraction of its messages that did not arrive, or arrived out of order.
         restarts: number of restarts of the neighbour since its first message.
@@ -37,7 +36,6 @@ class Peer:
     sequence: int = 0
     last: Message | None = None
     heard: float = -np.inf
-    said: float = -np.inf
     trip: float = np.nan
     lost: float = 0.0
     restarts: int = 0
@@ -87,7 +85,7 @@ class Peers:
         """Number of refused messages, by reason."""
         return {str(reason): count for reason, count in self._checker.counts.items()}
 
-    def hear(self) -> list[Message]:
+    def receive(self) -> list[Message]:
         """The received messages that pass every check, in the order of their arrival."""
         accepted = []
         for payload in self._transport.receive():
@@ -97,11 +95,10 @@ class Peers:
                 accepted.append(message)
         return accepted
 
-    def say(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
+    def send(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
         """Send a message to a neighbour. `single`: indices of the arrays that are written in 32 bits."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
-        peer.said = now
         echo, ack = (np.nan, 0) if peer.last is None else (peer.last.sent + (now - peer.heard), peer.last.sequence)
         payload = encode(
             Message(

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.network.node.core import Core, Kept, Moment, Rows, Turned
-from consat.network.node.pairs import Letter, Packing
+from consat.network.node.core import Core, IndexMap, Moment, Rows, StepResult
+from consat.network.node.pairs import MessageLayout, Packing
 from consat.network.node.part import Part
-from consat.network.node.problem import Alone, ends
+from consat.network.node.problem import OwnSolver, ends
 from consat.numerics import quick_compilation
 from consat.problem.constraints.library import farthest
 from consat.protocols import InteriorPoint, Known
@@ -65,12 +65,12 @@ class PairCore:
         self.protocol, self.whole = protocol, whole
         self.part = whole.without(gone)
         self.ends = ends(self.part)
-        self.solver = Alone.of(self.part, protocol.speaks)
+        self.solver = OwnSolver.of(self.part, protocol.speaks)
         self.width, self.largest = 0, np.zeros(0)
-        self.letters = {neighbour.id: Letter.of(neighbour, whole.team.dimension).numbers() for neighbour in whole.neighbours}
+        self.pair_numbers = {neighbour.id: MessageLayout.of(neighbour, whole.team.dimension).numbers() for neighbour in whole.neighbours}
         assert self.solver.interior is not None
         self.packing = Packing.of(whole, self.part, self.solver.interior.plan.width)
-        self._weight = {neighbour.id: Letter.of(neighbour, whole.team.dimension).weight for neighbour in whole.neighbours}
+        self._weight = {neighbour.id: MessageLayout.of(neighbour, whole.team.dimension).weight for neighbour in whole.neighbours}
         order = [neighbour for neighbour, _ in self.ends]
         self._end = np.array([order.index(neighbour.id) for neighbour in self.part.neighbours], dtype=int)
         self._begin, self._turn = _compiled()
@@ -78,14 +78,14 @@ class PairCore:
     def begin(self, first: np.ndarray, time: float = 0.0) -> PairState:
         return self._begin(self.protocol, self.solver, first, time)
 
-    def turn(self, state: PairState, inbox: Rows, arrived: Rows, moment: Moment) -> Turned:
+    def turn(self, state: PairState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         heard = inbox.pair, arrived.pair, moment.fresh[self._end]
         when = moment.round, moment.margin, moment.time
         state, said, bound, least = self._turn(self.protocol, self.solver, self.packing, state, heard, when)
         said = np.asarray(said)
         if asks_for(self.part) > FAR * self.part.reach:
             said, bound = self._without_proof(said), np.inf
-        return Turned(state, Rows(inbox.link, said), np.asarray(state.inner.x), float(bound), float(least))
+        return StepResult(state, Rows(inbox.link, said), np.asarray(state.inner.x), float(bound), float(least))
 
     def _without_proof(self, said: np.ndarray) -> np.ndarray:
         said = said.copy()
@@ -98,7 +98,7 @@ class PairCore:
     def among(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
         return PairCore(self.protocol, whole or self.whole, gone)
 
-    def anew(self, state: PairState) -> PairState:
+    def without_proofs(self, state: PairState) -> PairState:
         """Copy of the state with the count of changes raised by one, and without bounds."""
         memory: Any = state.inner.memory
         more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # JAX would compile
@@ -107,7 +107,7 @@ class PairCore:
 
     def carry(self, other: Core, state: PairState, first: np.ndarray, time: float = 0.0) -> PairState:
         """Initial state with the old estimates, and with the count of changes raised by one."""
-        fresh = self.begin(np.asarray(Kept.of(self, other).merge("row", state.inner.x, first)), time)
+        fresh = self.begin(np.asarray(IndexMap.of(self, other).merge("row", state.inner.x, first)), time)
         memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
         return fresh._replace(inner=fresh.inner._replace(memory=memory))
 
@@ -118,7 +118,7 @@ def asks_for(part: Part) -> float:
     return max((farthest(family.psi, family.parameters, part.center) for family in part.team.families), default=0.0)
 
 
-def _begin(protocol: InteriorPoint, solver: Alone, first: Array, time: Array) -> PairState:
+def _begin(protocol: InteriorPoint, solver: OwnSolver, first: Array, time: Array) -> PairState:
     return _strong(PairState(protocol.start(first, solver.at(time)), jnp.full(2, jnp.inf), jnp.zeros(())))
 
 
@@ -130,7 +130,7 @@ def _strong(state: PairState) -> PairState:
 
 def _turn(
     protocol: InteriorPoint,
-    solver: Alone,
+    solver: OwnSolver,
     packing: Packing,
     state: PairState,
     heard: tuple[Array, Array, Array],

@@ -34,7 +34,7 @@ TAIL: Final = 3
 """Number of entries before the quadratic of the proof: Σλ, c and the error."""
 
 
-class Letter(NamedTuple):
+class MessageLayout(NamedTuple):
     """Layout of the messages to one neighbour.
 
     Attributes:
@@ -46,7 +46,7 @@ class Letter(NamedTuple):
     level: bool
 
     @classmethod
-    def of(cls, neighbour: Neighbour, dimension: int) -> Letter:
+    def of(cls, neighbour: Neighbour, dimension: int) -> MessageLayout:
         """Layout for a neighbour. `dimension`: d."""
         places = [(agent, axis) for agent in neighbour.travels for axis in range(dimension)]
         return cls((*places, *[None] * neighbour.level), neighbour.level)
@@ -158,13 +158,13 @@ class Packing:
             width: p of the mail.
         """
         dimension, known = whole.team.dimension, {neighbour.id: neighbour for neighbour in whole.neighbours}
-        letters = [Letter.of(known[neighbour.id], dimension) for neighbour in part.neighbours]
-        kept = [Letter.of(neighbour, dimension) for neighbour in part.neighbours]
+        layouts = [MessageLayout.of(known[neighbour.id], dimension) for neighbour in part.neighbours]
+        kept = [MessageLayout.of(neighbour, dimension) for neighbour in part.neighbours]
         count = _Flat(width).total
-        longest = max((letter.length for letter in letters), default=0)
-        out, back = np.full((len(letters), longest), count), np.full((len(letters), count), longest)
-        for row, (letter, there) in enumerate(zip(letters, kept, strict=True)):
-            for place, numbers in enumerate(_layout(letter, there, _Flat(width))):
+        longest = max((layout.length for layout in layouts), default=0)
+        out, back = np.full((len(layouts), longest), count), np.full((len(layouts), count), longest)
+        for row, (layout, there) in enumerate(zip(layouts, kept, strict=True)):
+            for place, numbers in enumerate(_layout(layout, there, _Flat(width))):
                 if numbers:
                     out[row, place] = numbers[0]
                     back[row, numbers] = place
@@ -218,21 +218,21 @@ class _Flat(NamedTuple):
         return HEAD + TAIL + 2 * (self.width**2 + self.width)
 
 
-def _layout(letter: Letter, there: Letter, flat: _Flat) -> Iterator[list[int]]:
+def _layout(layout: MessageLayout, there: MessageLayout, flat: _Flat) -> Iterator[list[int]]:
     """For each entry of a message the indices of the equal entries of the flat mail; none for absent agents.
 
     Args:
-        letter: layout of the message, with all agents.
+        layout: layout of the message, with all agents.
         there: layout of the mail, without absent agents.
         flat: layout of the flat mail.
     """
     place = {name: k for k, name in enumerate(there.names)}
     matrix, vector, slope, force = (begin for begin, *_ in flat.arrays)
     yield from ([k] for k in range(3))
-    yield [3] if letter.level else []
+    yield [3] if layout.level else []
     for names, square, line, head in (
-        (letter.names, matrix, vector, range(0)),
-        (letter.names[: letter.size - letter.level], slope, force, range(HEAD, HEAD + TAIL)),
+        (layout.names, matrix, vector, range(0)),
+        (layout.names[: layout.size - layout.level], slope, force, range(HEAD, HEAD + TAIL)),
     ):
         yield from ([k] for k in head)
         at = [place.get(name) for name in names]

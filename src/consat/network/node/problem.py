@@ -66,7 +66,7 @@ class OwnLinks:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Alone(LocalSolver):
+class OwnSolver(LocalSolver):
     """`LocalSolver` of one agent.
 
     Attributes:
@@ -80,7 +80,7 @@ class Alone(LocalSolver):
     me: int = field(metadata={"static": True})
 
     @classmethod
-    def of(cls, part: Part, speaks: str = "link") -> Alone:
+    def of(cls, part: Part, speaks: str = "link") -> OwnSolver:
         """Build from a part. Rows are in the order of `part.team.ids`; the agent has index 0 of 1.
 
         Args:

@@ -13,16 +13,16 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam
 from consat.network.node import guard
 from consat.network.node.body import Body
-from consat.network.node.core import LARGEST, Embodied, Look, Moment, Rows
+from consat.network.node.core import LARGEST, AgentView, Embodied, Moment, Rows
 from consat.network.node.membership import Membership
 from consat.network.node.neighbours import Peers
+from consat.network.node.news import NewsFilter
 from consat.network.node.pair_core import PairCore
-from consat.network.node.pairs import Letter, halves, whole
+from consat.network.node.pairs import MessageLayout, halves, whole
 from consat.network.node.part import Part
-from consat.network.node.sieve import Sieve
 from consat.network.transports import Transport
 from consat.network.wire import VERSION, Expected, Kind, Message, Numbers, Reason
-from consat.numerics import float64
+from consat.numerics import float64, number
 from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.schedule import Schedule
 
@@ -77,8 +77,8 @@ class Station:
         self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
         self.membership = Membership(part)
         self._beat = beat
-        self._sieve = self._new_sieve()
-        self._letters = {} if beat is None else _brief(part, core)
+        self._filter = self._new_filter()
+        self._halves = {} if beat is None else _brief(part, core)
         self.peers = Peers(
             part,
             part.problem(mode, "all" if beat is None else "events"),
@@ -86,7 +86,7 @@ class Station:
                 neighbour.id: _expected(
                     len(neighbour.shares),
                     core.largest,
-                    self._letters.get(neighbour.id) or (core.letters[neighbour.id],),
+                    self._halves.get(neighbour.id) or (core.pair_numbers[neighbour.id],),
                     frames,
                     stamped,
                     same=stamped and beat is not None,
@@ -108,14 +108,14 @@ class Station:
         self._down = frozenset(self.peers.all)
         self._next_report = clock()
         self._gone: frozenset[str] = frozenset()
-        self._look: Look | None = None
+        self._view: AgentView | None = None
         self.target: np.ndarray | None = None
         """(d,) target of the body; None before the first step."""
         self.regroup(None, part.first)
 
-    def _new_sieve(self) -> Sieve | None:
+    def _new_filter(self) -> NewsFilter | None:
         """Chooses what is sent for the core as it is now; None if everything is."""
-        return None if self._beat is None else Sieve(self.core, self._beat)
+        return None if self._beat is None else NewsFilter(self.core, self._beat)
 
     # -- membership --------------------------------------------------------------------------------------------------------------------
 
@@ -137,8 +137,8 @@ class Station:
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
             before, self.core = self.core, self.core.among(gone)
-            self._sieve = self._new_sieve()
-            self._gone, self._look = gone, None
+            self._filter = self._new_filter()
+            self._gone, self._view = gone, None
             if state is not None:
                 state = self.core.carry(before, state, self.among(first), self._time)
         place = {end: k for k, end in enumerate(self.core.ends)}
@@ -169,7 +169,7 @@ class Station:
     @property
     def estimates(self) -> dict[str, np.ndarray]:
         """The newest estimate, (d,), of each position that the agent holds."""
-        return {} if self._look is None else dict(zip(self.core.part.team.ids, self._look.x, strict=True))
+        return {} if self._view is None else dict(zip(self.core.part.team.ids, self._view.x, strict=True))
 
     @property
     def satisfied(self) -> bool:
@@ -212,25 +212,25 @@ class Station:
         if is_adjustment(team, changes):
             self.part = replace(self.part, team=adjusted(team, changes))
             self.core = before.adjusted(self.part)
-            state = state and self.core.anew(state)
+            state = state and self.core.without_proofs(state)
         else:
             self.part = replace(self.part, team=changed(team, changes))
             self.core = before.among(self._gone, self.part)
-            self._sieve = self._new_sieve()
+            self._filter = self._new_filter()
             state = state and self.core.carry(before, state, self.among(self.first()), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state
 
-    def reborn(self, state: Any) -> Any:
+    def check_restarts(self, state: Any) -> Any:
         """The state, with proofs dropped if a neighbour has restarted since the last call, because its constraints may have changed."""
         before, self._restarts = self._restarts, sum(peer.restarts for peer in self.peers.all.values())
-        return state if before == self._restarts else self.core.anew(state)
+        return state if before == self._restarts else self.core.without_proofs(state)
 
     # -- messages ----------------------------------------------------------------------------------------------------------------------
 
-    def hear(self) -> list[Message]:
+    def receive(self) -> list[Message]:
         """The received messages, after an update of the membership with them."""
-        messages = self.peers.hear()
+        messages = self.peers.receive()
         if not self._strange and self.peers.dropped.get(Reason.VERSION):
             self._strange = True
             self.log("refused", why=f"a neighbour speaks another version of the wire format than {VERSION}; update the team as a whole")
@@ -238,7 +238,7 @@ class Station:
             if message.kind not in (Kind.GOODBYE, Kind.SAME):
                 shares = self.peers.all[message.source].known.shares
                 epochs = message.arrays[0] if message.kind is Kind.HELLO else message.arrays[0][:, -1]
-                self.membership.hear(shares, epochs)
+                self.membership.update(shares, epochs)
         now = self.clock()
         for neighbour in self.present:
             peer = self.peers.all[neighbour]
@@ -254,25 +254,25 @@ class Station:
 
         Returns:
             For each neighbour [block, letter]. Block: (shares, width + 1), the core's row of each shared position, 0 for absent agents, and
-            in the last column the membership number of each agent. Letter: the core's row for this neighbour, 0 if it is absent.
+            in the last column the membership number of each agent. MessageLayout: the core's row for this neighbour, 0 if it is absent.
         """
         told = {}
         for neighbour, place in self._places.items():
             block = np.zeros((len(place), self.core.width + 1))
             block[place >= 0, :-1] = outbox.link[place[place >= 0]]
             block[:, -1] = self.membership.of(self.peers.all[neighbour].known.shares)
-            letter, row = np.zeros(self.core.letters[neighbour].shape), self._turn_of.get(neighbour)
+            message, row = np.zeros(self.core.pair_numbers[neighbour].shape), self._turn_of.get(neighbour)
             if row is not None:
-                letter = outbox.pair[row, : len(letter)]
-            short = self._letters.get(neighbour)
-            told[neighbour] = [block, *([letter] if short is None else halves(letter, 1 + short[0].shape[0]))]
+                message = outbox.pair[row, : len(message)]
+            short = self._halves.get(neighbour)
+            told[neighbour] = [block, *([message] if short is None else halves(message, 1 + short[0].shape[0]))]
         return told
 
     def empty(self) -> tuple[Rows, Rows]:
         """Inbox and mask of arrival without messages."""
         return self.core.empty()
 
-    def sort(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
+    def deliver(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
         """Write a message into the inbox. Rows of links are used where both ends agree on the membership of the shared agent; the row of
         the neighbour is used where they agree on all shared agents.
 
@@ -282,38 +282,38 @@ class Station:
             inbox: rows of the messages; modified.
             arrived: masks of arrival; modified.
         """
-        block, *letters = told
-        letter = letters[0] if len(letters) == 1 else whole(*letters)
+        block, *pair = told
+        message = pair[0] if len(pair) == 1 else whole(*pair)
         place, row = self._places[neighbour], self._turn_of.get(neighbour)
         same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
         agrees = (place >= 0) & same
         inbox.link[place[agrees]] = block[agrees, :-1]
         arrived.link[place[agrees]] = True
         if row is not None and same.all():
-            inbox.pair[row, : len(letter)] = letter
+            inbox.pair[row, : len(message)] = message
             arrived.pair[row] = True
 
-    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, Look]:
+    def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, AgentView]:
         """Compute a step; see `Embodied.turn`. Messages that would make the state NaN or infinite are not used; see `guard`."""
         self._time = moment.time
         done = guard.turn(self.core, state, inbox, arrived, moment)
         for neighbour in done.refused:
             self.log("refused", peer=neighbour)
-        if done.anew:
+        if done.restarted:
             self.log("anew")
-        return done.state, done.outbox, done.look
+        return done.state, done.outbox, done.view
 
-    def sift(self, rows: Rows) -> tuple[Rows, AbstractSet[str]]:
+    def filter(self, rows: Rows) -> tuple[Rows, AbstractSet[str]]:
         """What the neighbours hold after this turn, and who has to be told for that: all, where all is sent."""
-        if self._sieve is None:
+        if self._filter is None:
             return rows, self.peers.all.keys()
-        rows, goes = self._sieve.sift(rows)
+        rows, goes = self._filter.filter(rows)
         return rows, self.peers.all.keys() - {self.present[k] for k in np.flatnonzero(~goes)}
 
     def resume(self, rows: Rows, state: Any) -> None:
         """Go on after rows that were said before a restart, with the state of then."""
-        if self._sieve is not None:
-            self._sieve.resume(rows, np.asarray(state.bodies.position))
+        if self._filter is not None:
+            self._filter.resume(rows, np.asarray(state.bodies.position))
 
     def same(self, told: Sequence[np.ndarray]) -> list[np.ndarray]:
         """What a neighbour says by silence where nothing gets lost, given what it said a round ago."""
@@ -322,31 +322,31 @@ class Station:
             block[:, column] += block[:, column] > 0
         return [block, *told[1:]]
 
-    def say_same(self, number: np.ndarray, to: Iterable[str]) -> None:
+    def send_same(self, round_: np.ndarray, to: Iterable[str]) -> None:
         """Say that a round brought no news."""
         for neighbour in to:
-            self.peers.say(neighbour, Kind.SAME, [number])
+            self.peers.send(neighbour, Kind.SAME, [round_])
 
-    def greet(self) -> None:
+    def send_hello(self) -> None:
         """Send a greeting, which contains the membership, to the neighbours."""
         for neighbour in self._listeners():
-            self.peers.say(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
+            self.peers.send(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
-    def say(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
+    def send(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
         """Send a state message to all neighbours that are present, or to those in `to`. `arrays`: see `blocks`; `among`: limits both."""
         for neighbour in self._listeners() if to is None else to:
             if among is None or neighbour in among:
-                single = [k for k, array in enumerate(arrays[neighbour]) if neighbour in self._letters and k % 3 == 1]
-                self.peers.say(neighbour, Kind.STATE, arrays[neighbour], tuple(single))
+                single = [k for k, array in enumerate(arrays[neighbour]) if neighbour in self._halves and k % 3 == 1]
+                self.peers.send(neighbour, Kind.STATE, arrays[neighbour], tuple(single))
 
     def silent(self, among: AbstractSet[str]) -> list[str]:
         """The neighbours that are not among those who are told."""
         return [neighbour for neighbour in self._listeners() if neighbour not in among]
 
-    def goodbye(self) -> None:
+    def send_goodbye(self) -> None:
         """Send a goodbye: the process stops. An agent that leaves for good announces that in earlier messages."""
         for neighbour in self._listeners():
-            self.peers.say(neighbour, Kind.GOODBYE, [])
+            self.peers.send(neighbour, Kind.GOODBYE, [])
 
     def _listeners(self) -> list[str]:
         """Present neighbours, and absent ones that were heard recently, because they may not know that they count as absent."""
@@ -387,19 +387,19 @@ class Station:
         """Log one event."""
         self._log({"event": event, "id": self.part.me, "t": self.clock(), **details})
 
-    def move(self, look: Look, stamp: float) -> None:
+    def move(self, view: AgentView, stamp: float) -> None:
         """Command the body towards the agent's estimate, record its position, and log what is new.
 
         Args:
-            look: result of the last step.
+            view: result of the last step.
             stamp: round or time, s, of the recorded position.
         """
-        self.target = look.x[self._me()]
+        self.target = view.x[self._me()]
         self.body.follow(self.target, self.clock())
         position = self.body.position()
         if position is not None:
             self._track.append([stamp, *position.tolist()])
-        self._look = look
+        self._view = view
         self.conclude(stamp)
         if self._period <= 0:
             self.report()
@@ -411,19 +411,19 @@ class Station:
             stamp: round or time, s, of the event.
             lately: whether the others were heard recently. If not, the agent does not know where they are.
         """
-        look, before = self._look, (self._known, self._near)
+        view, before = self._view, (self._known, self._near)
         self._known, self._near = None, False
-        if look is not None and lately and look.known > 0:
+        if view is not None and lately and view.known > 0:
             self._known = "satisfied"
-        elif look is not None and look.bound < 0:
-            self._known, self._near = "infeasible", lately and look.near
+        elif view is not None and view.bound < 0:
+            self._known, self._near = "infeasible", lately and view.near
         if before != (self._known, self._near):
             if self._known is None:
                 self.log("unsatisfied" if before[0] == "satisfied" else "undecided", stamp=stamp)
             elif self._known == "satisfied":
                 self.log("satisfied", stamp=stamp)
-            elif look is not None:
-                self.log("infeasible", stamp=stamp, near=self._near, bound=look.bound, margin=_number(look.least))
+            elif view is not None:
+                self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=number(view.least))
 
     def _me(self) -> int:
         """The agent's row among the agents that are present."""
@@ -455,20 +455,20 @@ class Station:
         `margin` is the agent's margin at its `position` and the last received positions of the others' bodies; `estimate_margin` is its
         margin at its estimates; `bound` is a proven upper bound on the best margin of the team.
         """
-        look, position = self._look, self.body.position()
+        view, position = self._view, self.body.position()
         margin = estimate_margin = None
-        if look is not None:
-            estimate_margin = _number(self.core.margin(look.x, self._time))
-            if look.heard and position is not None:
-                bodies = look.bodies.copy()
+        if view is not None:
+            estimate_margin = number(self.core.margin(view.x, self._time))
+            if view.heard and position is not None:
+                bodies = view.bodies.copy()
                 bodies[self._me()] = position
-                margin = _number(self.core.margin(bodies, self._time))
+                margin = number(self.core.margin(bodies, self._time))
         peers = {}
         for neighbour, peer in self.peers.all.items():
             if neighbour not in self._gone:
                 trip = None if np.isnan(peer.trip) else round(peer.trip, 6)
                 peers[neighbour] = {
-                    "up": neighbour not in self._down, "silent": _number(round(self.clock() - peer.heard, 4)),
+                    "up": neighbour not in self._down, "silent": number(round(self.clock() - peer.heard, 4)),
                     "loss": round(peer.lost, 4), "trip": trip,
                 }  # fmt: skip
         self.log(
@@ -476,8 +476,8 @@ class Station:
             position=None if position is None else position.tolist(),
             margin=margin,
             estimate_margin=estimate_margin,
-            known=None if look is None else look.known,
-            bound=None if look is None else _number(look.bound),
+            known=None if view is None else view.known,
+            bound=None if view is None else number(view.bound),
             track=self._track,
             peers=peers,
             sent=dict(self.peers.sent),
@@ -486,16 +486,11 @@ class Station:
         self._track = []
 
 
-def _number(value: float) -> float | None:
-    """A float for JSON; None where it is not finite."""
-    return value if np.isfinite(value) else None
-
-
 def _expected(
-    shares: int, largest: np.ndarray, letters: Sequence[Numbers], frames: int, stamped: bool, *, same: bool
+    shares: int, largest: np.ndarray, pair: Sequence[Numbers], frames: int, stamped: bool, *, same: bool
 ) -> Expected:  # fmt: skip
     """Expected arrays of a neighbour's messages. The last number of each row is a membership number."""
-    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *letters]
+    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *pair]
     found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {
         Kind.HELLO: [(shares,)],
         Kind.STATE: [*frame * frames, *[(1,)] * stamped],
@@ -508,4 +503,4 @@ def _brief(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
     """The halves of what is said to each neighbour as a whole, if anything is."""
     if not isinstance(core.core, PairCore):
         return {}
-    return {neighbour.id: Letter.of(neighbour, part.team.dimension).brief() for neighbour in part.neighbours}
+    return {neighbour.id: MessageLayout.of(neighbour, part.team.dimension).brief() for neighbour in part.neighbours}

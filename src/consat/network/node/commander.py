@@ -17,7 +17,7 @@ PERIOD: Final = 0.1
 """Largest time between two commands, s."""
 
 
-class Helm:
+class Commander:
     """Sends commands to a measured body while its position is known. A simulated body needs no commands.
 
     Args:
@@ -58,7 +58,7 @@ class Helm:
         self._target, self._due = target, now + PERIOD
         self._command(self._still if target is None or self._over else self._body.follow(target, now))
 
-    def stand(self) -> None:
+    def halt(self) -> None:
         """Command the body to stop; all later commands are to stop, too."""
         self._over = True
         self._command(self._still)

@@ -24,7 +24,7 @@ FAREWELLS: Final = 30
 """Number of messages in which a leaving agent announces it: enough under heavy message loss."""
 
 
-class Paced:
+class FixedRate:
     """Runner of one agent with a fixed rate.
 
     Args:
@@ -58,7 +58,7 @@ class Paced:
     def step(self) -> float:
         """See `Runner.step`."""
         station = self.station
-        for message in station.hear():
+        for message in station.receive():
             if message.kind is Kind.STATE:
                 self._latest[message.source] = message.arrays
         now = station.clock()
@@ -71,7 +71,7 @@ class Paced:
             self._turn(now)
         else:
             self._due = now + GREETING
-            station.greet()
+            station.send_hello()
         station.watch()
         return self._due
 
@@ -79,7 +79,7 @@ class Paced:
         self._due += self._period
         self._farewells -= 1
         self.done = self._farewells == 0
-        self.station.greet()
+        self.station.send_hello()
 
     def _ready(self, now: float) -> bool:
         station = self.station
@@ -100,20 +100,20 @@ class Paced:
         if station.changed:
             self._state = station.regroup(self._state, station.first())
             self._regrouped = self._count
-        self._state = station.reborn(self._state)
+        self._state = station.check_restarts(self._state)
         inbox, arrived = station.empty()
         for neighbour, told in self._latest.items():
-            station.sort(neighbour, told, inbox, arrived)
+            station.deliver(neighbour, told, inbox, arrived)
         self._latest.clear()
         moment = Moment(
             float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place(),
             time=station.now(),
         )  # fmt: skip
-        self._state, outbox, look = station.turn(self._state, inbox, arrived, moment)
+        self._state, outbox, view = station.turn(self._state, inbox, arrived, moment)
         self._last = now
         self._count += 1
-        outbox, listeners = station.sift(outbox)
-        station.say(station.blocks(outbox), among=listeners)
-        station.move(look, now)
+        outbox, listeners = station.filter(outbox)
+        station.send(station.blocks(outbox), among=listeners)
+        station.move(view, now)
         if self._turns is not None and self._count >= self._turns:
             self.done = True

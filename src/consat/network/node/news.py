@@ -19,8 +19,8 @@ from consat.protocols.agreement import NEVER, Word
 from consat.protocols.sending import Crossing, Held
 
 
-class Said(NamedTuple):
-    """What an agent remembers of what it said.
+class Sent(NamedTuple):
+    """What an agent remembers of what it sent.
 
     Attributes:
         rows: what the neighbours hold.
@@ -33,7 +33,7 @@ class Said(NamedTuple):
     place: np.ndarray
 
 
-class Sieve:
+class NewsFilter:
     """Of one core.
 
     Args:
@@ -51,19 +51,19 @@ class Sieve:
         self._how = _How(inner.protocol, inner.layout if isinstance(inner, RoundCore) else None, shape, not np.isfinite(beat))
         self._packing = inner.packing if isinstance(inner, PairCore) else None
         empty, _ = core.empty()
-        self._said = Said(empty, np.full(len(order), NEVER), np.zeros((len(core.ends), shape[0])))
+        self._sent = Sent(empty, np.full(len(order), NEVER), np.zeros((len(core.ends), shape[0])))
 
     def resume(self, rows: Rows, bodies: np.ndarray) -> None:
         """Go on after what was said last; bodies: (rows, d) where they were then."""
         place = np.asarray(self._core.core.solver.links.at(jnp.asarray(bodies)))
-        self._said = Said(rows, np.ones(len(self._said.since)), place)
+        self._sent = Sent(rows, np.ones(len(self._sent.since)), place)
 
-    def sift(self, rows: Rows) -> tuple[Rows, np.ndarray]:
+    def filter(self, rows: Rows) -> tuple[Rows, np.ndarray]:
         """What the neighbours hold after this turn, and (G,) to whom it has to be sent for that."""
-        found = _compiled()(self._how, self._inner.solver, self._packing, rows, self._said, (self._pair, self._beat))
+        found = _compiled()(self._how, self._inner.solver, self._packing, rows, self._sent, (self._pair, self._beat))
         link, pair, since, place, goes = map(np.asarray, found)
-        self._said = Said(Rows(link, pair), since, place)
-        return self._said.rows, goes
+        self._sent = Sent(Rows(link, pair), since, place)
+        return self._sent.rows, goes
 
 
 class _How(NamedTuple):
@@ -95,12 +95,12 @@ def _rows(how: _How, packing: Any, crossing: Crossing, pair: Array) -> tuple[Arr
     return jnp.concatenate([*leaves, crossing.told[:, None], *bodies], axis=1), pair
 
 
-def _sift(
-    how: _How, solver: Any, packing: Any, rows: Rows, said: Said, to: tuple[Array, Array]
+def _filtered(
+    how: _How, solver: Any, packing: Any, rows: Rows, sent: Sent, to: tuple[Array, Array]
 ) -> tuple[Array, ...]:  # fmt: skip
     pair, beat = to
-    new, old = (_crossing(how, solver, packing, each) for each in (rows, said.rows))
-    held = Held(old, jnp.asarray(said.since), jnp.asarray(said.place))
+    new, old = (_crossing(how, solver, packing, each) for each in (rows, sent.rows))
+    held = Held(old, jnp.asarray(sent.since), jnp.asarray(sent.place))
     crossing, held, goes = sending.sifted(how.protocol, solver, new, held, pair, beat=beat, lasting=how.lasting)
     link, mail = _rows(how, packing, crossing, jnp.asarray(rows.pair))
     assert held.place is not None
@@ -109,4 +109,4 @@ def _sift(
 
 @functools.cache
 def _compiled() -> Callable[..., Any]:
-    return jax.jit(_sift, static_argnames=("how",), compiler_options=quick_compilation())
+    return jax.jit(_filtered, static_argnames=("how",), compiler_options=quick_compilation())
