@@ -11,7 +11,7 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam
 from consat.problem.family import Family
 from consat.problem.team import Team
-from consat.robots.description import Robots, obstacle_data
+from consat.scenario.robots import Robots, obstacle_data
 from consat.views import bodies, picture
 from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Shapes, moves, shapes

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
-import inspect
 import json
 import math
 import threading
@@ -18,12 +16,12 @@ import numpy as np
 
 from consat.errors import ConsatError, Fault, InvalidInput, InvalidTeam, closest, shown
 from consat.numerics import float64
-from consat.problem.constraints import KINDS
 from consat.problem.constraints.record import OWNER, Constraint, flatten
 from consat.problem.team import Agent, Team
 from consat.runs.preparation import robots_of, scenario_of
 from consat.runs.session import Session, assessed
 from consat.scenario import Scenario, dump
+from consat.scenario.mappings import constraint
 from consat.server import frames, orders
 from consat.server.background import Background
 from consat.server.board import Board
@@ -610,24 +608,8 @@ class Simulation:
 
 
 def _made(described: Mapping[str, Any]) -> Any:
-    """A constraint as a scenario file has it, made. Raises: ConsatError: it is none."""
-    given = dict(described)
-    kind = given.pop("kind", None)
-    if not isinstance(kind, str) or kind not in KINDS:
-        message = f"there is no kind {shown(kind)}{closest(kind, KINDS)}; the kinds are {', '.join(KINDS)}"
-        raise InvalidInput([Fault(("kind",), message, "constraint")])
-    keys = _keys(kind)
-    if unknown := [key for key in given if key not in keys]:
-        message = f"{kind} has no {unknown[0]!r}{closest(unknown[0], keys)}; it has {', '.join(keys)}"
-        raise InvalidInput([Fault((unknown[0],), message, kind)])
-    if missing := [key for key, each in keys.items() if each.default is each.empty and key not in given]:
-        raise InvalidInput([Fault((missing[0],), f"{missing[0]} is missing; {kind} needs it", kind)])
-    for key in ("agent", "name", "psi"):
-        if key in given and not isinstance(given[key], str):
-            raise InvalidInput([Fault((key,), f"{key} is {shown(given[key])}, but must be text", kind)])
-    return KINDS[kind](**given)
-
-
-@functools.cache
-def _keys(kind: str) -> Mapping[str, inspect.Parameter]:
-    return inspect.signature(KINDS[kind]).parameters
+    """A constraint from its mapping in an order. Raises: InvalidInput: it is none."""
+    made, faults = constraint(described, "constraint")
+    if faults:
+        raise InvalidInput(faults)
+    return made

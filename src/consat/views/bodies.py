@@ -16,8 +16,8 @@ from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from consat.results.result import Result
-from consat.robots.description import Robots
 from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
+from consat.scenario.robots import Robots
 
 SOLID: Final = "0.62"
 """Colour of obstacles. Only obstacles are solid grey; keep-outs are hatched."""

@@ -24,7 +24,7 @@ from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.robots.description import obstacle_data
+from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
 from consat.views.figures import number, period, recorded, seconds
