@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from consat.errors import InvalidSettings
 from consat.results.result import Result
 from consat.views import space
-from consat.views.figures import colour, recorded, seconds, view
+from consat.views.areas import SHARED, colour_of
+from consat.views.colours import LINK
+from consat.views.figures import recorded, seconds, view
 from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
@@ -32,8 +35,6 @@ ROUND: Final = 0.1
 MOST_NAMED, MOST_SHAPES, MOST_NUMBERS = 200, 2_000, 10_000_000
 THIN: Final = 0.02
 """Height of discs in the plane, relative to their radius."""
-KEEP_OUT: Final = (0.3, 0.3, 0.3)
-LINK: Final = (0.45, 0.5, 0.57)
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> Path:
@@ -177,7 +178,7 @@ class _Scene:
             if k and not balls.moves[j]:
                 continue
             out, radius = bool(balls.keeps_out[j]), float(balls.radius[j])
-            shade = _colour(KEEP_OUT if out else _rgb(balls.owners[j]), 0.7 if out else 0.12)
+            shade = _colour(SHARED if out else colour_of(balls.owners[j]), 0.7 if out else 0.12)
             pose = messages.Pose(position=_vector(centers[j]), orientation=messages.Quaternion(w=1.0))
             thick = 2 * radius if not self._flat else (4 if out else 1) * THIN * radius
             size = messages.Vector3(x=2 * radius, y=2 * radius, z=thick)
@@ -189,14 +190,15 @@ class _Scene:
                 body = {"spheres": [messages.SpherePrimitive(pose=pose, size=size, color=shade)]}
             angle = np.linspace(0, 2 * np.pi, 65)[:, None]
             ring = centers[j] + radius * np.concatenate([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-            yield self._entity(name, stamp, lines=[self._line(ring, KEEP_OUT if out else _rgb(balls.owners[j]), 2.0)], **body)
+            yield self._entity(name, stamp, lines=[self._line(ring, SHARED if out else colour_of(balls.owners[j]), 2.0)], **body)
 
     def _walls(self, walls: Walls, stamp: Any) -> Iterator[SceneEntity]:
         if walls.normal.shape[1] == 1:
             return
         for k, corners in space.faces(walls, self._low, self._high):
             closed = corners if len(corners) == 2 else np.concatenate([corners, corners[:1]])
-            yield self._entity(f"wall {int(walls.number[k])}", stamp, lines=[self._line(_in_space(closed), _rgb(walls.owners[k]), 2.0)])
+            line = self._line(_in_space(closed), colour_of(walls.owners[k]), 2.0)
+            yield self._entity(f"wall {int(walls.number[k])}", stamp, lines=[line])
 
     def _outlines(self, k: int, x: np.ndarray, stamp: Any) -> Iterator[SceneEntity]:
         if self._team is None:
@@ -206,10 +208,10 @@ class _Scene:
             return
         now = self._team.at(float(self._times[k]))
         for number, found in zip(asked, outlines(now, asked, x[:, :2], self._low, self._high), strict=True):
-            shade = _rgb((int(self._team.owner[number]),))
+            shade = colour_of((int(self._team.owner[number]),))
             yield self._entity(f"region {number}", stamp, lines=[self._line(_in_space(line), shade, 2.0) for line in found])
 
-    def _line(self, points: np.ndarray, shade: tuple[float, float, float], thickness: float, *, pairs: bool = False) -> Any:
+    def _line(self, points: np.ndarray, shade: str, thickness: float, *, pairs: bool = False) -> Any:
         from foxglove import messages
 
         kind = messages.LinePrimitiveLineType.LineList if pairs else messages.LinePrimitiveLineType.LineStrip
@@ -223,17 +225,12 @@ class _Scene:
         from foxglove import messages
 
         pose = messages.Pose(position=_vector(place), orientation=messages.Quaternion(w=1.0))
-        shade = _colour((0.1, 0.1, 0.1), 1.0)
+        shade = _colour("0.1", 1.0)
         return messages.TextPrimitive(pose=pose, billboard=True, font_size=14.0, scale_invariant=True, color=shade, text=name)
 
 
-def _rgb(owners: tuple[int, ...]) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
-
-    return to_rgb(colour(owners[0])) if len(owners) == 1 else KEEP_OUT
-
-
-def _colour(shade: tuple[float, float, float], alpha: float) -> Color:
+def _colour(shade: str, alpha: float) -> Color:
     from foxglove.messages import Color
 
-    return Color(r=shade[0], g=shade[1], b=shade[2], a=alpha)
+    red, green, blue = to_rgb(shade)
+    return Color(r=red, g=green, b=blue, a=alpha)

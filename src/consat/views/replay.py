@@ -27,7 +27,7 @@ from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
-from consat.views.figures import number, period, recorded, seconds
+from consat.views.figures import period, recorded, seconds
 from consat.views.outlines import MOST, outlines
 from consat.views.picture import FEW, MOST_SHAPES
 from consat.views.shapes import Balls, moves, shapes
@@ -79,7 +79,7 @@ def page(result: Result) -> str:
         "tone": "good" if good else "bad",
         "sign": "✓" if good else "✗",
         "status": escape(words.STATUS[status]),
-        "chart": escape(f"at the end {_said(summary['margin'])}"),
+        "chart": escape(f"at the end {words.typeset(summary['margin'])}"),
         "agents": counted(count, "agent") if few else f"{counted(count, 'agent')}, the tightest first",
         "scale": "" if few else _scale(result),
         "scale_hidden": "hidden" if few else "",
@@ -94,22 +94,16 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _said(value: float | None) -> str:
-    return "none" if value is None else number(value)
-
-
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
     summary = result.summary
     yield "verdict", words.VERDICT[summary["verdict"]]
     lower, upper = summary.get("bounds") or (None, None)
     if lower is not None and upper is not None:
-        yield (
-            "best possible",
-            f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
-        )
+        ends = dict.fromkeys(map(words.typeset, (lower, upper)))  # one, if they look alike
+        yield "best possible", f"{' to '.join(ends)}, proven"
     since = summary["satisfied_from"]
     if since["time"] is not None:
-        yield "satisfied from", f"t = {number(since['time'])} s"
+        yield "satisfied from", f"t = {words.typeset(since['time'])} s"
     elif since["round"] is not None:
         yield "satisfied from", f"round {since['round']:.0f}"
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
@@ -126,7 +120,9 @@ def _scale(result: Result) -> str:
     palette, edges = _palette(result)
     wide = 100 / len(palette)
     bars = "".join(f'<rect x="{wide * k:.2f}%" y="0" width="{wide:.2f}%" height="14" fill="{shade}"/>' for k, shade in enumerate(palette))
-    texts = "".join(f'<text x="{wide * (k + 1):.2f}%" y="27" text-anchor="middle">{number(edge)}</text>' for k, edge in enumerate(edges))
+    texts = "".join(
+        f'<text x="{wide * (k + 1):.2f}%" y="27" text-anchor="middle">{words.typeset(edge)}</text>' for k, edge in enumerate(edges)
+    )
     return f'<h2>margin (red: violated)</h2><svg role="img" aria-label="Colours of margins, from violated to satisfied">{bars}{texts}</svg>'
 
 
