@@ -13,6 +13,7 @@ import numpy as np
 
 from consat.errors import ConsatError
 from consat.problem.team import Team
+from consat.protocols import ROUNDS
 from consat.runs.preparation import scenario_of
 from consat.scenario import Scenario
 from consat.server import orders
@@ -201,8 +202,8 @@ class Simulation:
     def _show_state(self) -> None:
         editor = self._editor
         self._display.show("state", {
-            "type": "state", "revision": self._display.revision, "playing": self._playing, "speed": self._speed, "loss": editor.loss,
-            "protocol": editor.session.protocol, "rate": editor.session.rate, "undo": len(editor.undos), "busy": self._busy,
-            "cut": editor.cut,
+            "type": "state", "revision": self._display.revision, "playing": self._playing, "speed": self._speed, "busy": self._busy,
+            "loss": editor.loss, "protocol": editor.session.protocol, "protocols": list(ROUNDS), "rate": editor.session.rate,
+            "undo": len(editor.undos), "cut": editor.cut,
             "silent": {name: np.asarray(each.agent.start)[:3].tolist() for name, each in editor.silent.items()},
         })  # fmt: skip

@@ -30,7 +30,7 @@ from consat.views.colours import classes
 from consat.views.figures import period, recorded, seconds
 from consat.views.outlines import MOST, outlines
 from consat.views.picture import FEW, MOST_SHAPES
-from consat.views.shapes import Balls, moves, shapes
+from consat.views.shapes import Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
@@ -226,30 +226,57 @@ def _regions(
     found = shapes(team, times[-1])
     balls, walls = picture.constraints_of(team, found)
     moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
-    seen = [shapes(team, times[moment]).balls for moment in moments]
+    seen = [shapes(team, times[moment]) for moment in moments]
+    ties = moves(team)
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
-            {**ball, "track": _track(moments, seen, k) if seen and found.balls.moves[k] else None}
+            {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
             for k, ball in enumerate(picture.balls_of(team, found, balls))
         ],
-        "walls": picture.walls_of(team, found.walls, walls, low, high),
+        "walls": _walls(team, [*seen, found], walls, ties[found.walls.number], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
     return low, high, told
 
 
 def _moments(x: np.ndarray) -> np.ndarray:
-    """Samples at which moving regions are told."""
+    """Samples at which moving regions are written."""
     return np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int))
 
 
-def _track(moments: np.ndarray, seen: Sequence[Balls], k: int) -> Mapping[str, Any]:
-    """Where a ball is at some samples; between them it moves evenly."""
+def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
+    """Centre and radius of ball k at some samples. The page interpolates between them."""
     return {
         "at": moments.tolist(),
-        "center": [np.round(balls.center[k], 6).tolist() for balls in seen],
-        "radius": [round(float(balls.radius[k]), 6) for balls in seen],
+        "center": [np.round(each.balls.center[k], 6).tolist() for each in seen],
+        "radius": [round(float(each.balls.radius[k]), 6) for each in seen],
     }
+
+
+def _walls(
+    team: Team, seen: Sequence[Shapes], members: list[list[int]], ties: np.ndarray, moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]
+) -> list[Mapping[str, Any]]:
+    """The half-spaces, those that move with their corners and normals at some samples; without corners where they are out of view.
+
+    Args:
+        team: the team.
+        seen: its geometry at the samples, and, as the last, at the end.
+        members: from `picture.constraints_of`.
+        ties: (K,) whether each half-space moves.
+        moments: the samples.
+        box: lower and upper corner of the view.
+    """
+    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, members, *box)} for each in seen)
+    found: list[Mapping[str, Any]] = []
+    for k, moving in enumerate(ties.tolist()):
+        known = [each[k] for each in (*before, last) if k in each]
+        if not known or not (moving and before):
+            found += known[-1:]
+            continue
+        normals = [np.round(each.walls.normal[k], 6).tolist() for each in seen[:-1]]
+        corners = [each[k]["corners"] if k in each else [] for each in before]
+        found.append({**known[-1], "track": {"at": moments.tolist(), "corners": corners, "normal": normals}})
+    return found
 
 
 def _outlines(

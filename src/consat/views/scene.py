@@ -511,9 +511,20 @@ def _joined(segments: np.ndarray) -> np.ndarray:
     return np.concatenate([segments, np.full_like(segments[:, :1], np.nan)], axis=1).reshape(-1, segments.shape[2]).T
 
 
-def moments(scene: Scene, count: int, movement: float) -> np.ndarray:
-    """(count,) moments from start to end, spaced by a mean of distance travelled (weight `movement`, 0 to 1) and clock."""
+def moments(scene: Scene, count: int, movement: float, longest: float = 1.0) -> np.ndarray:
+    """Moments from start to end, (count,), spaced by a mean of distance travelled and clock.
+
+    Args:
+        scene: the scene.
+        count: number of moments.
+        movement: weight of the distance, 0 to 1.
+        longest: largest share of the moments within one recorded step, if there are enough steps.
+    """
     x, clock = scene.x[: scene.last + 1], scene.steps[: scene.last + 1] - float(scene.steps[0])
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
     share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
+    steps, longest = np.diff(share), max(longest, 1.2 / max(1, len(share) - 1))
+    while steps.sum() > 0 and steps.max() > 1.01 * longest * steps.sum():
+        steps = np.minimum(steps, longest * steps.sum())
+    share = np.append(0.0, np.cumsum(steps))
     return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
