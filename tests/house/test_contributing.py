@@ -33,12 +33,18 @@ assert session.change("a", "zone", center=[2, 0]).step(20).satisfied
     "A protocol": """
 r = cs.run("case-b", protocol="bounded-flow", until=200, start=(-1, 1))
 assert r.summary["protocol"] == "bounded-flow" and r.summary["margin"] > -1, r.summary
+from click.testing import CliRunner
+from consat.cli.commands import cli
+assert "bounded-flow" in CliRunner().invoke(cli, ["run", "--help"]).output
 """,
     "An export": """
 import pathlib, tempfile
 with tempfile.TemporaryDirectory() as folder:
     path = cs.run("case-b", rounds=3).export(f"{folder}/run.jsonl")
     assert len(pathlib.Path(path).read_text().splitlines()) == 4
+from click.testing import CliRunner
+from consat.cli.commands import cli
+assert ".jsonl" in CliRunner().invoke(cli, ["export", "--help"]).output
 """,
     "A fault": """
 from consat.faults import Faults

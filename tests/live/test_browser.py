@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import consat as cs
-from consat.server import simulation
+from consat.server import display
 from tests.browser import BROWSER, needs_browser
 from tests.live.test_widget import Comm, message
 
@@ -112,8 +112,8 @@ def test_team_torn_apart_says_why(tab: Tab) -> None:
 
 def test_nothing_is_said_to_be_proven_of_a_team_that_has_changed_since(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     """Assessments that take long come in while the goal moves on: the page goes on saying that it assesses."""
-    find = simulation.assessed
-    monkeypatch.setattr(simulation, "assessed", lambda team: (time.sleep(0.4), find(team))[1])
+    find = display.assessed
+    monkeypatch.setattr(display, "assessed", lambda team: (time.sleep(0.4), find(team))[1])
     watch = """() => {
         window.seen = [];
         const read = (name) => document.querySelector(`[data-part=${name}]`).textContent;

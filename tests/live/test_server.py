@@ -236,11 +236,11 @@ def test_client_that_reads_nothing_slows_nobody_and_nothing_is_kept_for_it() -> 
         )
         simulation = live._simulation
         end = time.monotonic() + 60.0
-        while simulation._session.round < 5:  # it watches, so the team goes on
+        while simulation._editor.session.round < 5:  # it watches, so the team goes on
             assert time.monotonic() < end
             time.sleep(0.05)
         tracemalloc.start()
-        before, longest = simulation._session.round, 0.0
+        before, longest = simulation._editor.session.round, 0.0
         for _ in range(2000):  # 400 MB
             begun = time.monotonic()
             simulation.board.put("frame", bytes(200_000))
@@ -252,7 +252,7 @@ def test_client_that_reads_nothing_slows_nobody_and_nothing_is_kept_for_it() -> 
         assert kept < 20_000_000
         assert longest < 1.0
         end = time.monotonic() + 60.0
-        while simulation._session.round < before + 20:
+        while simulation._editor.session.round < before + 20:
             assert time.monotonic() < end
             time.sleep(0.05)
 

@@ -10,7 +10,7 @@ from consat.network.node.orders import Orders
 from consat.network.node.part import read_part, split, write_part
 from consat.network.node.pilot import HELD, RobotBody
 from consat.numerics import float64
-from consat.robots.description import Robots
+from consat.scenario.robots import Robots
 
 TICK = 0.05
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import consat as cs
-from consat.robots.description import Robots
+from consat.scenario.robots import Robots
 
 CROSSING = """
 consat: 1
@@ -107,7 +107,7 @@ def test_python_says_the_same_as_a_file() -> None:
     [
         (("kind: unicycle, radius", "kind: unicycel, radius"), "there is no kind 'unicycel'"),
         (("radius: 0.1, speed: 0.5", "radius: -1, speed: 0.5"), "robots, radius: must be positive, but is -1"),
-        (("turn_rate", "turnrate"), "unknown key 'turnrate'; did you mean 'turn_rate'"),
+        (("turn_rate", "turnrate"), "there is no key 'turnrate'"),
         (("robot: {speed: 0.4}", "robot: {speed: fast}"), "agent 'b', robot"),
         (("kind: disc, center: [0, 0], radius: 0.25", "kind: polygon, vertices: [[0, 0], [1, 1], [1, 0], [0, 1]]"), "cross"),
         (("center: [0, 0], radius: 0.25", "center: [0, 0, 0], radius: 0.25"), "obstacles[0]"),

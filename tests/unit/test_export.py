@@ -47,6 +47,13 @@ def test_csv_has_a_row_for_each_agent_at_each_round(tmp_path: Path) -> None:
         assert row["margin"] == "" if agent == 2 else float(row["margin"]) == pytest.approx(margins[step, agent])
 
 
+def test_csv_has_seconds_where_rounds_take_time(tmp_path: Path) -> None:
+    result = cs.run("case-b", rate=5.0, until=2.0)
+    rows = list(csv.DictReader(result.export(tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()))
+    assert list(rows[0]) == ["round", "agent", "time", "x", "y", "margin"]
+    assert [float(row["time"]) for row in rows] == pytest.approx([int(row["round"]) / 5.0 for row in rows])
+
+
 @pytest.mark.parametrize(("name", "said"), [
     ("run.xyz", "run.xyz ends in .xyz, but must end in one of .csv, .gif, .html, .mcap, .mp4"),
     ("run.htm", "run.htm ends in .htm, but must end in one of .csv, .gif, .html, .mcap, .mp4; did you mean '.html'?"),
@@ -255,3 +262,54 @@ def test_goals_that_move_are_told_along_their_way(tmp_path: Path) -> None:
     later = [dict(fields(entity))[3] for field, entity in fields(found[5][1]) if field == 2]
     assert b"region 0" in later
     assert b"keep-out 1" not in later
+
+
+def wall_on_its_way() -> Result:
+    """A wall that moves from x = 2 out of the view, and a side of a box that moves from 3 to 1, in 21 samples."""
+    wall = cs.halfspace([1, 0], cs.schedule([0, 300], [2, 500]), name="wall")
+    sides = cs.box([-1, -1], cs.schedule([0, 300], [[3, 1], [1, 1]]))
+    team = cs.Team([cs.Agent("a", [wall]), cs.Agent("b", [sides])], links=[("a", "b")])
+    return made(team, np.array([[0.0, 0.0], [0.0, 0.5]]), samples=21)
+
+
+def test_half_spaces_that_move_are_told_along_their_way(tmp_path: Path) -> None:
+    result = wall_on_its_way()
+    walls = {wall["names"][0]: wall for wall in replay.document(result)["walls"]}
+    track = walls["wall"]["track"]
+    assert track["at"][0] == 0
+    assert [corner[0] for corner in track["corners"][0]] == [2, 2]
+    assert track["corners"][-1] == []  # it has left the view
+    right = walls["box.high[0]"]["track"]
+    assert [corners[0][0] for corners in right["corners"]] == pytest.approx(3 - np.array(right["at"]) / 10)
+    assert "track" not in walls["box.low[0]"]
+    found = messages(result.export(tmp_path / "run.mcap"))["/scene"]
+    later = [dict(fields(entity))[3] for field, entity in fields(found[5][1]) if field == 2]
+    assert b"wall 0" in later
+    assert result.team is not None
+    still = list(result.team.names).index("box.low[0]")
+    assert f"wall {still}".encode() not in later
+
+
+def test_mcap_holds_bodies_headings_and_obstacles(tmp_path: Path) -> None:
+    team = cs.Team([cs.Agent("a", [cs.within([2, 0], 0.5)], [0, 0]), cs.Agent("b", [cs.within([0, 2], 0.5)], [0, 1])])
+    stand = [cs.disc([5, 5], 0.5), cs.polygon([[4, -4], [5, -4], [4, -3]])]
+    result = cs.run(team, robots="unicycle", obstacles=stand, rate=10.0, until=3.0)
+    found = messages(result.export(tmp_path / "run.mcap"))
+    first, last = ([dict(fields(entity)) for field, entity in fields(found["/scene"][k][1]) if field == 2] for k in (0, -1))
+    assert {b"obstacle 0", b"obstacle 1", b"bodies"} <= {entity[3] for entity in first}
+    assert b"obstacle 0" not in {entity[3] for entity in last}
+    assert found["/scene"][-1][0] == pytest.approx(3.0)  # a round takes 0.1 s
+    frames = [dict(fields(value)) for field, value in fields(found["/tf"][-1][1]) if field == 1]
+    turned = [{field: np.frombuffer(value)[0] for field, value in fields(frame[5])} for frame in frames]
+    angles = [2 * np.arctan2(each.get(3, 0.0), each.get(4, 0.0)) for each in turned]
+    assert np.cos(angles) == pytest.approx(np.cos(result.data["heading"].values[-1]))
+    assert np.sin(angles) == pytest.approx(np.sin(result.data["heading"].values[-1]))
+
+
+def test_a_film_dwells_on_no_round() -> None:
+    from consat.views.scene import Scene, moments
+
+    scene = Scene(cs.run("case-b", rounds=30))
+    shown = moments(scene, 72, 0.75, 0.0625)
+    assert (shown[0], shown[-1]) == (0, 30)
+    assert np.bincount(shown.astype(int)).max() <= 6

@@ -113,7 +113,7 @@ export function agentInWords(scene: Scene, i: number, where: Float32Array, margi
 }
 
 /** Buttons and boxes that every host has. Gives whether colours are dark. */
-export function bindControls(part: Part, view: View, chart: Chart, redraw: () => void): () => boolean {
+export function bindControls(part: Part, view: View, chart: Chart, redraw: () => void, fit = view.fit): () => boolean {
   let dark = preferDark();
   const paint = () => {
     const name = dark ? "dark" : "light";
@@ -128,7 +128,7 @@ export function bindControls(part: Part, view: View, chart: Chart, redraw: () =>
     paint();
   });
   part("fit").addEventListener("click", () => {
-    view.fit();
+    fit();
     redraw();
   });
   for (const name of ["trails", "links", "regions", "names"] as const satisfies (keyof Shown)[]) {

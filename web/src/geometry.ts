@@ -1,6 +1,6 @@
 // Pure functions of the view: what lies under a pointer, where labels go, which colours margins have.
 
-import type { Ball, Scale } from "./model";
+import type { Ball, Scale, Scene, Wall } from "./model";
 
 export type Point = [number, number];
 type Box = [number, number, number, number];
@@ -188,11 +188,87 @@ export function turned(a: Float32Array, b: Float32Array, share: number): Float32
 /** A ball as it is at a moment of a record. */
 export function ballAt(ball: Ball, moment: number): Ball {
   if (!ball.track) return ball;
-  const { at, center, radius } = ball.track;
+  const { center, radius } = ball.track;
+  const { a, b, mix } = within(ball.track.at, moment);
+  return { ...ball, center: center[a].map((value, k) => mix(value, center[b][k])), radius: mix(radius[a], radius[b]) };
+}
+
+/** A half-space as it is at a moment. A boundary that gets more or fewer corners on the way stays as it was until it has them. */
+export function wallAt(wall: Wall, moment: number): Wall {
+  if (!wall.track) return wall;
+  const { corners, normal } = wall.track;
+  const { a, b, mix } = within(wall.track.at, moment);
+  const between = corners[a].length === corners[b].length;
+  const mixed = (u: number[], v: number[]) => u.map((value, k) => mix(value, v[k]));
+  return {
+    ...wall,
+    corners: between ? corners[a].map((corner, k) => mixed(corner, corners[b][k])) : corners[a],
+    normal: mixed(normal[a], normal[b]),
+  };
+}
+
+/** Between which of some samples a moment lies, and a mean of values at both. */
+function within(at: number[], moment: number) {
   let a = 0;
   while (a < at.length - 1 && at[a + 1] <= moment) a += 1;
   const b = Math.min(a + 1, at.length - 1);
   const share = b > a ? Math.min(1, Math.max(0, (moment - at[a]) / (at[b] - at[a]))) : 0;
-  const mix = (u: number, v: number) => (1 - share) * u + share * v;
-  return { ...ball, center: center[a].map((value, k) => mix(value, center[b][k])), radius: mix(radius[a], radius[b]) };
+  return { a, b, mix: (u: number, v: number) => (1 - share) * u + share * v };
 }
+
+/** A region is left out of the view if it makes it so many times wider than the formation, and than the region itself. */
+const FAR = 6;
+
+/** The box that holds a scene as it is: agents, obstacles, and regions that are not far away. */
+export function extent(scene: Scene, where: ArrayLike<number>): { low: number[]; high: number[] } {
+  const d = scene.dimension;
+  const axes = [...Array(d).keys()];
+  const low = axes.map(() => Number.POSITIVE_INFINITY);
+  const high = axes.map(() => Number.NEGATIVE_INFINITY);
+  const side = (a: number[], b: number[]) => Math.max(...axes.map((k) => b[k] - a[k]), 0);
+  const add = (from: number[], to: number[]) => {
+    for (const k of axes) {
+      low[k] = Math.min(low[k], from[k]);
+      high[k] = Math.max(high[k], to[k]);
+    }
+  };
+  for (let i = 0; i < scene.count; i += 1) {
+    const at = axes.map((k) => where[i * d + k]);
+    if (at.every(Number.isFinite)) add(at, at);
+  }
+  if (!Number.isFinite(low[0])) return { low: scene.low, high: scene.high };
+  const team = side(low, high);
+  const hold = (points: number[][]) => {
+    if (!points.length) return;
+    const from = axes.map((k) => Math.min(...points.map((point) => point[k] ?? 0)));
+    const to = axes.map((k) => Math.max(...points.map((point) => point[k] ?? 0)));
+    const whole = side(
+      low.map((value, k) => Math.min(value, from[k])),
+      high.map((value, k) => Math.max(value, to[k])),
+    );
+    if (whole <= FAR * Math.max(team, side(from, to))) add(from, to);
+  };
+  const round = (center: number[], radius: number) => hold([center.map((value) => value - radius), center.map((value) => value + radius)]);
+  for (const ball of scene.balls)
+    if (ball.around < 0) round(ball.center, ball.radius);
+    else if (scene.few)
+      round(
+        ball.center.map((value, k) => value + where[ball.around * d + k]),
+        ball.radius,
+      );
+  const span = side(scene.low, scene.high);
+  for (const { corners } of scene.walls) if (corners.every((corner) => distance(corner, corners[0]) <= 3 * span)) hold(corners);
+  for (const each of scene.obstacles)
+    if (each.center) round(each.center, each.radius ?? 0);
+    else hold(each.vertices ?? [each.low!, each.high!]);
+  for (const { at } of scene.silent) hold([at]);
+  const least = side(low, high) || 1;
+  for (const k of axes) {
+    const spare = Math.max(0, 0.75 * least - (high[k] - low[k])) / 2 + 0.08 * least;
+    low[k] -= spare;
+    high[k] += spare;
+  }
+  return { low, high };
+}
+
+const distance = (a: number[], b: number[]) => Math.hypot(...a.map((value, k) => value - b[k]));

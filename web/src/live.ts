@@ -3,7 +3,7 @@
 import { createChart } from "./chart";
 import { agentInWords, bindControls, createRows, tellAt, watchHands } from "./controls";
 import { unpack } from "./decode";
-import { between, type Hit, type Point, scaleOf, tightest, turned } from "./geometry";
+import { between, extent, type Hit, type Point, scaleOf, tightest, turned } from "./geometry";
 import { type Ball, FEW, type Frame, type Scene, say } from "./model";
 import { parts } from "./page";
 import { createPanel } from "./panel";
@@ -12,7 +12,6 @@ import { type Answer, type Carrier, connect, type Message } from "./socket";
 import { createView, type Held } from "./view";
 
 const SPEEDS = [1, 2, 5, 10, 20, 50, 100, 200, 500];
-const PROTOCOLS = ["interior-point", "max-min", "admm", "proximal", "selfish"];
 /** Rounds whose paths are drawn. */
 const TRAIL = 200;
 const MOUSE = 12;
@@ -23,6 +22,7 @@ export interface State {
   speed: number;
   loss: number;
   protocol: string;
+  protocols: string[];
   undo: number;
   busy: string | null;
   cut: [string, string][];
@@ -87,7 +87,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
   let scene = EMPTY;
   let number = 0;
   let constraints: [number, string][] = [];
-  let state: State = { playing: true, speed: 20, loss: 0, protocol: "", undo: 0, busy: null, cut: [], silent: {} };
+  let state: State = { playing: true, speed: 20, loss: 0, protocol: "", protocols: [], undo: 0, busy: null, cut: [], silent: {} };
   let bounds: [number | null, number | null] | null = null;
   let verdict = "undecided";
   let reasons: string[] = [];
@@ -212,7 +212,9 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
       part<HTMLSelectElement>("speed").value = String(state.speed);
       if (document.activeElement !== part("loss")) part<HTMLInputElement>("loss").value = String(state.loss);
       part("lost").textContent = `${Math.round(100 * state.loss)} %`;
-      part<HTMLSelectElement>("protocol").value = state.protocol;
+      const chooser = part<HTMLSelectElement>("protocol");
+      if (!chooser.length) chooser.append(...state.protocols.map((value) => new Option(value, value)));
+      chooser.value = state.protocol;
       part<HTMLButtonElement>("undo").disabled = state.undo === 0;
       if (state.busy) say_(`${state.busy} …`, false, "busy");
       else hush("busy");
@@ -316,6 +318,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
         headings: null,
         margin: past.margins[looking],
         step: past.rounds[looking],
+        phase: 0,
         sample: Math.min(TRAIL, looking),
         moment: 0,
         past: past.last(looking + 1, TRAIL),
@@ -331,8 +334,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     }
     const headings = before?.headings && now.headings ? turned(before.headings, now.headings, share) : now.headings;
     const history = past.last(past.length - (share < 1 || !scene.few ? 1 : 0), TRAIL);
-    const step = (before?.round ?? now.round) * (1 - share) + now.round * share;
-    return { ...now, where, headings, step, sample: history.length, moment: 0, past: history };
+    return { ...now, where, headings, step: now.round, phase: share % 1, sample: history.length, moment: 0, past: history };
   }
 
   function tick(time: number): void {
@@ -638,6 +640,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
 
   const click = (name: string, act: () => void) => part(name).addEventListener("click", act);
   const fit = () => {
+    if (now) Object.assign(scene, extent(scene, now.where));
     view.fit();
     dirty = true;
   };
@@ -689,7 +692,6 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     look(past.rounds.findIndex((round) => round >= at));
   });
   part<HTMLSelectElement>("speed").append(...SPEEDS.map((value) => new Option(`${value} rounds/s`, String(value))));
-  part<HTMLSelectElement>("protocol").append(...PROTOCOLS.map((value) => new Option(value, value)));
   part("speed").addEventListener("change", () => order_({ do: "speed", rounds: Number(part<HTMLSelectElement>("speed").value) }));
   part("protocol").addEventListener("change", () => order_({ do: "protocol", kind: part<HTMLSelectElement>("protocol").value }));
   part("loss").addEventListener("input", () => {
@@ -775,7 +777,7 @@ export function createLive(root: HTMLElement, carrier: Carrier) {
     send: (message: Record<string, unknown>) => order_(message),
   };
 
-  const dark = bindControls(part, view, chart, redraw);
+  const dark = bindControls(part, view, chart, redraw, fit);
   const rows = createRows(part("rows"), dark, (who) => {
     if ("silent" in who) order_({ do: "revive", agent: who.silent });
     else choose({ kind: "agent", k: who.k });

@@ -7,6 +7,13 @@ export interface Track {
   radius: number[];
 }
 
+/** Where a half-space ends that moves by a schedule; without corners where it is out of view. */
+export interface WallTrack {
+  at: number[];
+  corners: number[][][];
+  normal: number[][];
+}
+
 export interface Ball {
   center: number[];
   /** Place of the agent that it moves with, or -1. */
@@ -26,6 +33,7 @@ export interface Wall {
   owners: number[];
   names: string[];
   place: number;
+  track?: WallTrack | null;
 }
 
 export interface Outline {
@@ -98,8 +106,10 @@ export interface Frame {
   /** Which way robots look, rad. */
   headings: Float32Array | null;
   margin: number;
-  /** Round, or time in s. */
+  /** Round, or time in s, of the margins. */
   step: number;
+  /** How far the messages of the next round are on their way, 0 to 1. */
+  phase: number;
   /** Entries of the history that have passed. */
   sample: number;
   /** The same, with how much of the next has passed. */

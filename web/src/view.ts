@@ -1,6 +1,6 @@
 // Frame → picture, on a canvas. The view knows nothing of recordings or sockets.
 
-import { ballAt, gripOf, type Hit, hitTest, type Point, placeLabels, shadeOf, type Targets } from "./geometry";
+import { ballAt, gripOf, type Hit, hitTest, type Point, placeLabels, shadeOf, type Targets, wallAt } from "./geometry";
 import type { Ball, Frame, Obstacle, Outline, Scene, Wall } from "./model";
 import { THEMES, type Theme, type ThemeName } from "./theme";
 
@@ -290,7 +290,8 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     });
   }
 
-  function drawWall(wall: Wall, held: boolean): void {
+  function drawWall(frame: Frame, told: Wall, held: boolean): void {
+    const wall = wallAt(told, frame.moment);
     const colour = ownerColour(wall.owners, false);
     pen.strokeStyle = pen.fillStyle = colour;
     pen.lineWidth = held ? 3.5 : isChosen(wall.owners) ? 2.4 : 1.4;
@@ -487,7 +488,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     pen.globalAlpha = 1;
     if (show.messages && links.length <= 120) {
       // A message each way in every round.
-      const share = frame.step - Math.floor(frame.step);
+      const share = frame.phase;
       pen.fillStyle = theme.link;
       pen.beginPath();
       for (let k = 0; k < links.length; k += 1) {
@@ -684,7 +685,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
   /** Regions, but those that are held or chosen. */
   function drawRegions(frame: Frame): void {
     scene.walls.forEach((wall, k) => {
-      if (!isHeld("wall", k)) drawWall(wall, false);
+      if (!isHeld("wall", k)) drawWall(frame, wall, false);
     });
     if (!scene.few && !scene.space) drawUnion(frame);
     for (const out of [false, true]) {
@@ -706,7 +707,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
       if (show.regions) drawRegions(frame);
     } else {
       // In a crowd regions stand still: those that move with a teammate are not drawn.
-      const moment = scene.balls.some((ball) => ball.track) ? frame.moment : 0;
+      const moment = [...scene.balls, ...scene.walls].some((shape) => shape.track) ? frame.moment : 0;
       const { held, chosen, regions } = show;
       copied(ground, [camera, moment, regions, held?.kind, held?.k, chosen?.kind, chosen?.k].join(), () => {
         drawGround();
@@ -715,7 +716,7 @@ export function createView(canvas: HTMLCanvasElement, first: Scene) {
     }
     if (show.regions) for (const outline of scene.outlines) drawOutline(frame, outline);
     scene.walls.forEach((wall, k) => {
-      if (isHeld("wall", k)) drawWall(wall, true);
+      if (isHeld("wall", k)) drawWall(frame, wall, true);
     });
     scene.balls.forEach((ball, k) => {
       if (isChosen(ball.owners) || isHeld("grip", k)) drawBall(frame, ball, !scene.few || isChosen(ball.owners), isHeld("grip", k));

@@ -30,12 +30,16 @@ from consat.cli.terminal import (
     UNSATISFIED,
     USAGE,
     Burst,
+    Listing,
+    OneOf,
     estimates_option,
+    films,
     force_option,
     full_option,
     json_option,
     located,
     out_option,
+    protocols,
     scenario_argument,
     sends_option,
     set_option,
@@ -121,6 +125,18 @@ def _numbers(context: click.Context, parameter: click.Parameter, value: str | No
         raise click.BadParameter(f"{value!r} must be numbers, such as 0.1,0 for wind along x") from None
 
 
+def _robots() -> Iterable[str]:
+    from consat.scenario.robots import KINDS
+
+    return KINDS
+
+
+def _simulators() -> Iterable[str]:
+    from consat.robots.simulated import SIMULATORS
+
+    return SIMULATORS
+
+
 def _names(context: click.Context, parameter: click.Parameter, value: str | None) -> Any:
     return value if value in (None, "all", "none") else [name.strip() for name in str(value).split(",")]
 
@@ -132,7 +148,9 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
     "--protocol",
     metavar="KIND",
     shell_complete=completion.protocols,
-    help="interior-point (default), max-min, admm, proximal, gradient-flow, proportional-integral, selfish.",
+    cls=Listing,
+    listed=protocols,
+    help="One of {}; interior-point if not given, or admm for large teams.",
 )
 @estimates_option
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts and first estimates; overrides start.seed.")
@@ -149,12 +167,11 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
 @click.option("--burst", type=Burst(), help="Links turn bad with probability P a round, good again with Q.")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, where rounds take time.")
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
-@click.option(
-    "--robots", type=click.Choice(["point", "double", "unicycle", "quadrotor"]), help="What bodies are; by default the scenario's."
-)
+@click.option("--robots", type=OneOf(_robots), help="What bodies are; by default the scenario's.")
 @click.option("--wind", callback=_numbers, metavar="VX,VY", help="Velocity of the air, m/s, for robots.")
 @click.option("--noise", type=click.FloatRange(min=0), default=0.0, metavar="M", help="What a robot's position is measured wrong by, m.")
-@click.option("--simulator", metavar="NAME", help="Integrates the bodies of robots: mujoco; by default the robots' own models do.")
+@click.option("--simulator", metavar="NAME", cls=Listing, listed=_simulators,
+              help="Integrates the bodies of robots: {}; by default the robots' own models do.")  # fmt: skip
 @sends_option
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
 @click.option("--restarts", type=click.IntRange(min=1), default=1, metavar="K", help="Run from K starts, and tell of the best.")
@@ -356,8 +373,8 @@ def plot(result: Path, out: Path | None) -> None:
 
 @cli.command()
 @result_argument
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="FILM",
-              help="Where to, .gif or .mp4; a GIF beside the result if not given.")  # fmt: skip
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="FILM", cls=Listing, listed=films,
+              help="Where to, one of {}; a GIF beside the result if not given.")  # fmt: skip
 def animate(result: Path, out: Path | None) -> None:
     """Make a film of a saved RESULT, a file or the DIR of a run."""
     _cache_compilations()

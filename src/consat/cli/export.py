@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import click
 
 from consat.cli.completion import results
+from consat.cli.terminal import Listing, films
 from consat.network.deploy.environment import keep_compilations
 
 result_argument = click.argument("result", type=click.Path(path_type=Path), shell_complete=results)
 
 
+def _formats() -> Iterable[str]:
+    from consat.views.export import FORMATS
+
+    return FORMATS
+
+
 @click.command()
 @result_argument
 @click.option(
-    "--to", "target", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
-    help="Its ending says what kind: .csv, .gif, .html, .mcap or .mp4.",
+    "--to", "target", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE", cls=Listing, listed=_formats,
+    help="File to write. Its ending is one of {}.",
 )  # fmt: skip
 def export(result: Path, target: Path) -> None:
-    """Write a saved RESULT as CSV, GIF, HTML, MCAP or MP4.
+    """Write a saved RESULT in another format.
 
     RESULT is a file, or the DIR of a run. CSV has a row for each agent at each time or round; HTML replays the run offline;
     MCAP opens in Foxglove (consat[mcap]); MP4 needs consat[video].
@@ -30,7 +38,7 @@ def export(result: Path, target: Path) -> None:
     from consat.results.result import Result
     from consat.views.export import save
 
-    loaded, hidden = Result.load(result), not sys.stderr.isatty() or target.suffix.lower() not in (".gif", ".mp4")
+    loaded, hidden = Result.load(result), not sys.stderr.isatty() or target.suffix.lower() not in films()
     with click.progressbar(length=100, label="drawing", file=sys.stderr, hidden=hidden) as bar:
         written = save(loaded, target, progress=lambda done: bar.update(round(100 * done) - bar.pos))
     click.echo(written)

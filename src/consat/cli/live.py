@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from typing import Any
 
 import click
 
-from consat.cli.terminal import located, scenario_argument, set_option
+from consat.cli.terminal import Listing, located, scenario_argument, set_option
 from consat.network.deploy.environment import keep_compilations
+
+
+def _in_rounds() -> Iterable[str]:
+    from consat.protocols import ROUNDS
+
+    return ROUNDS
 
 
 @click.command()
@@ -17,7 +24,7 @@ from consat.network.deploy.environment import keep_compilations
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; others than this machine get in with a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=None, help="Where to listen; 8137, or a free one, if not given.")
 @click.option("--open/--no-open", "opens", default=True, help="Open the page in a browser.")
-@click.option("--protocol", metavar="KIND", help="One in rounds: interior-point (default), max-min, admm, proximal, selfish.")
+@click.option("--protocol", metavar="KIND", cls=Listing, listed=_in_rounds, help="One of {}; interior-point if not given.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of starts, and of what gets lost.")
 @click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
 def live(scenario: str, overrides: tuple[str, ...], host: str, port: int | None, opens: bool, **settings: Any) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -31,6 +31,55 @@ class Burst(click.ParamType[tuple[float, float]]):
         except ValueError:
             self.fail(f"it is {value!r}, but must be two probabilities, such as 0.05,0.5", param, ctx)
         return p, q
+
+
+class OneOf(click.Choice[str]):
+    """Type of an option whose choices stand in a registry. It is imported when the choices are needed, because imports take time.
+
+    Args:
+        listed: returns the choices.
+    """
+
+    def __init__(self, listed: Callable[[], Iterable[str]]) -> None:
+        self._listed, self.case_sensitive = listed, True
+
+    @property
+    def choices(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The names in the registry."""
+        return tuple(self._listed())
+
+
+class Listing(click.Option):
+    """Option whose help lists the names of a registry, in place of ``{}``. The registry is imported when the help is shown.
+
+    Args:
+        listed: returns the names.
+        given: as of `click.Option`.
+        options: as of `click.Option`.
+    """
+
+    def __init__(self, *given: Any, listed: Callable[[], Iterable[str]], **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._listed = listed
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Option and help."""
+        self.help = (self.help or "").format(", ".join(self._listed()))
+        return super().get_help_record(ctx)
+
+
+def protocols() -> Iterable[str]:
+    """Names of the protocols."""
+    from consat.settings import ProtocolKind
+
+    return get_args(ProtocolKind)
+
+
+def films() -> Iterable[str]:
+    """Endings of films."""
+    from consat.views.animation import FORMATS
+
+    return FORMATS
 
 
 scenario_argument = click.argument("scenario", metavar="FILE", shell_complete=scenarios)

@@ -11,6 +11,7 @@ import numpy as np
 
 from consat.numerics import float64
 from consat.robots.drive import Drive, Report, longest_halt
+from consat.robots.obstacles import overlaps
 
 
 @float64
@@ -73,13 +74,10 @@ def _drifts(drive: Drive, wind: float) -> bool:
 
 def _overlaps(drive: Drive, place: np.ndarray) -> str | None:
     """Text about the first robot that is nearer to another, or to an obstacle, than the filter keeps; None if there is none."""
-    from scipy.spatial import cKDTree
-
     size = np.asarray(drive.model.size(drive.count, drive.dt))
-    for first, second in sorted(cKDTree(place).query_pairs(2.0 * float(size.max()))):
-        gap = float(np.linalg.norm(place[first] - place[second]) - size[first] - size[second])
-        if gap < 0.0:
-            return f"robots {first} and {second} are {-gap:.3g} m nearer to each other than the filter keeps"
+    for first, second, distance in overlaps(place, size):
+        nearer = size[first] + size[second] - distance
+        return f"robots {first} and {second} are {nearer:.3g} m nearer to each other than the filter keeps"
     clear = np.asarray(drive.map.signed_distance(jnp.asarray(place))) - size
     if clear.min(initial=np.inf) < 0.0:
         return f"robot {int(np.argmin(clear))} is {-clear.min():.3g} m nearer to an obstacle than the filter keeps"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -351,18 +351,24 @@ def start_faults(names: Sequence[str], starts: np.ndarray, size: np.ndarray, obs
         size: (N,) radius that each robot keeps free, m.
         obstacles: map of the obstacles.
     """
-    from scipy.spatial import cKDTree
-
     faults = []
     clearance = np.asarray(obstacles.signed_distance(jnp.asarray(starts))) - size
     for index in np.flatnonzero(clearance < 0.0).tolist():
         off = _off(clearance[index] + size[index])
         text = f"start {starts[index].tolist()} must be {size[index]:g} m or more from every obstacle, but is {off}"
         faults.append(Fault(("agents", index, "start"), text, f"agent {names[index]!r}"))
-    pairs = cKDTree(starts).query_pairs(2.0 * float(np.max(size, initial=0.0))) if len(starts) > 1 else set()
-    for first, second in sorted(pairs):
-        distance, least = float(np.linalg.norm(starts[first] - starts[second])), size[first] + size[second]
-        if distance < least:
-            text = f"start must be {least:g} m or more from that of agent {names[first]!r}, but is {distance:.4g} m: their bodies overlap"
-            faults.append(Fault(("agents", int(second), "start"), text, f"agent {names[second]!r}"))
+    for first, second, distance in overlaps(starts, size):
+        least = size[first] + size[second]
+        text = f"start must be {least:g} m or more from that of agent {names[first]!r}, but is {distance:.4g} m: their bodies overlap"
+        faults.append(Fault(("agents", second, "start"), text, f"agent {names[second]!r}"))
     return faults
+
+
+def overlaps(places: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, float]]:
+    """Yield each pair of robots that overlap, and their distance, m. places: (N, d), m; size: (N,) radii, m."""
+    from scipy.spatial import cKDTree
+
+    for first, second in sorted(cKDTree(places).query_pairs(2.0 * float(np.max(size)))) if len(places) > 1 else ():
+        distance = float(np.linalg.norm(places[first] - places[second]))
+        if distance < size[first] + size[second]:
+            yield int(first), int(second), distance

@@ -21,7 +21,7 @@ from consat.protocols.sending import SENDS, Sends
 from consat.settings import Smoothing
 
 if TYPE_CHECKING:
-    from consat.robots.description import Robots
+    from consat.scenario.robots import Robots
 
 RATE = 20.0
 """Default rate of rounds, Hz, where constraints move with time or robots drive."""
@@ -89,7 +89,7 @@ class Options:
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
         """Options from `data`."""
-        from consat.robots.description import Robots
+        from consat.scenario.robots import Robots
 
         smoothing, robots = data["smoothing"], data["robots"]
         made = {

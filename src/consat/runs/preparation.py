@@ -26,7 +26,7 @@ from consat.settings import ProtocolSettings, Settings, Start
 
 if TYPE_CHECKING:
     from consat.robots import Drive
-    from consat.robots.description import Robots
+    from consat.scenario.robots import Robots
 
 DEFAULT_PROTOCOL = "interior-point"
 MANY = 5000
@@ -41,10 +41,10 @@ SHARP = 5e-4
 
 
 def robots_of(robots: Any, obstacles: Any, scenario: Scenario) -> Robots | None:
-    """The robots of a run; see `consat.robots.description.asked`. None for a team of points, without an import of `consat.robots`."""
+    """The robots of a run; see `consat.scenario.robots.asked`. None for a team of points, without an import of `consat.robots`."""
     if robots is None and obstacles is None and scenario.robots is None:
         return None
-    from consat.robots.description import asked
+    from consat.scenario.robots import asked
 
     return asked(robots, obstacles, scenario.robots, scenario.team.ids)
 

@@ -14,10 +14,10 @@ from consat.problem.objective import Objective, SmoothingSchedule, weigh
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.results.trace import Trace
-from consat.robots.description import Robots
 from consat.runs.advice import warnings_of
 from consat.runs.verdicts import verdicts
 from consat.scenario import Scenario
+from consat.scenario.robots import Robots
 from consat.settings import Settings
 
 SCHEMA = "consat.run/1"

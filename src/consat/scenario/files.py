@@ -19,7 +19,7 @@ from consat.scenario.writing import write
 from consat.settings import Settings
 
 if TYPE_CHECKING:
-    from consat.robots.description import Robots
+    from consat.scenario.robots import Robots
 
 _PACKAGE = resources.files("consat.scenario")
 

@@ -14,7 +14,8 @@ from consat.problem.constraints import KINDS
 from consat.problem.groups import ACROSS, MOST, PLACE, SHAPES, Group
 from consat.problem.schedule import KEYS as SCHEDULE_KEYS
 from consat.problem.team import LONGEST_UNIT, TOPOLOGIES, Agent
-from consat.scenario.schema import AGENT_KEYS, GROUP_KEYS, KEYS, MEMBER_KEYS, TEXT, VERSION
+from consat.scenario.mappings import TEXT
+from consat.scenario.schema import AGENT_KEYS, GROUP_KEYS, KEYS, MEMBER_KEYS, VERSION
 from consat.settings import Settings
 
 Json = dict[str, Any]
@@ -31,8 +32,8 @@ def json_schema() -> Json:
     Returns:
         a document for `json.dumps`; under ``$defs`` each kind of constraint, robot and obstacle is described on its own.
     """
-    from consat.robots.description import KINDS as ROBOTS
-    from consat.robots.description import SHAPES as OBSTACLES
+    from consat.scenario.robots import KINDS as ROBOTS
+    from consat.scenario.robots import SHAPES as OBSTACLES
 
     settings = Settings.model_json_schema(by_alias=True, ref_template="#/$defs/{model}")
     kinds = {f"constraint-{kind}": _constraint(kind, factory) for kind, factory in KINDS.items()}

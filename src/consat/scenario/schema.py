@@ -4,7 +4,6 @@ the values."""
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -12,18 +11,19 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from consat.errors import AT_KEY, Fault, InvalidExpression, InvalidInput, InvalidTeam, closest, counted, shown
+from consat.errors import AT_KEY, Fault, InvalidInput, InvalidTeam, counted, shown
 from consat.problem.constraints import KINDS
 from consat.problem.groups import MOST, Each, Group
 from consat.problem.parameters import LARGEST, is_number
 from consat.problem.team import Agent, Links, Team
 from consat.scenario.document import Document, Path
+from consat.scenario.mappings import constraint
 from consat.scenario.words import complaints, unknown_key
 from consat.settings import Settings
 
 if TYPE_CHECKING:
-    from consat.robots.description import Robots
     from consat.robots.obstacles import Obstacle
+    from consat.scenario.robots import Robots
 
 VERSION: Final = 1
 SETTINGS: Final = ("start", "protocol", "smoothing")
@@ -32,8 +32,6 @@ AGENT_KEYS: Final = ("id", "start", "robot", "constraints")
 GROUP_KEYS: Final = ("group", "count", "shape", "spacing", "scatter", "seed", "constraints")
 MEMBER_KEYS: Final = ("of", "agent")
 """Additional keys of constraints in a group, besides those of their kind."""
-TEXT: Final = (str, str | None, "str", "str | None")
-"""Annotations of those arguments of a factory that must be text in a scenario file."""
 COMMUNICATION_KEYS: Final = ("links", "graph")
 
 
@@ -125,7 +123,7 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
     agents = data.get("agents")
     if not any(key in data for key in ("robots", "obstacles")) and not _any_robot(agents):
         return None
-    from consat.robots.description import Robots, kind_of, model_of
+    from consat.scenario.robots import Robots, kind_of, model_of
 
     own = [
         (i, entry) for i, entry in enumerate(agents if isinstance(agents, list) else []) if isinstance(entry, dict) and entry.get("robot")
@@ -158,7 +156,7 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
 
 
 def _obstacles(data: Any, dimension: Any, faults: _Faults) -> list[Obstacle]:
-    from consat.robots.description import obstacle_of
+    from consat.scenario.robots import obstacle_of
 
     if data is not None and not isinstance(data, list):
         example = "[{kind: disc, center: [0, 0], radius: 1}]"
@@ -314,52 +312,10 @@ def _constraints(data: dict[str, Any], path: Path, where: str, faults: _Faults) 
 
 
 def _constraint(data: Any, path: Path, owner: str, faults: _Faults, besides: tuple[str, ...] | None = None) -> Any:
-    """The constraint made from its mapping in the file.
-
-    Args:
-        data: the mapping.
-        path: path of the mapping.
-        owner: the agent or group in words, for faults.
-        faults: receives faults.
-        besides: in a group, keys that are allowed but not arguments of the factory; None outside of a group.
-
-    Returns:
-        a constraint, or a list of them for a box; an empty list if the faults leave nothing to check.
-    """
-    where = f"{owner}, constraint {int(path[-1]) + 1}"
-    if not isinstance(data, dict):
-        faults.add(path, f"it is {shown(data)}, but must be a mapping such as {{kind: within, center: [2, 0], radius: 1}}", where)
-        return []
-    kind = data.get("kind")
-    if kind is None:
-        faults.add((*path, "kind"), f"kind is missing; it is one of {', '.join(KINDS)}", where)
-        return []
-    if not isinstance(kind, str) or kind not in KINDS:
-        faults.add((*path, "kind"), f"there is no kind {shown(kind)}; the kinds are {', '.join(KINDS)}{closest(kind, KINDS)}", where)
-        return []
-    name = data.get("name")
-    where = f"{owner}, constraint {name if isinstance(name, str) else kind!r}"
-    keys = _keys(kind)
-    data = faults.keys(path, data, ("kind", *keys, *(besides or ())), where)
-    needed = [key for key, parameter in keys.items() if parameter.default is parameter.empty]
-    # A missing required argument is replaced by "". The team's fault about it is dropped, because its path has a fault already.
-    given: dict[str, Any] = dict.fromkeys(needed, "")
-    for key, parameter in keys.items():
-        text = besides is None if key == "agent" else parameter.annotation in TEXT
-        if key in data and text and not isinstance(data[key], str):
-            faults.add((*path, key), f"{key} is {shown(data[key])}, but must be text; put numbers in quotes", where)
-        elif key in data:
-            given[key] = data[key]
-        elif key in needed:
-            faults.add((*path, key), f"{key} is missing; {kind} needs {', '.join(needed)}", where)
-    try:
-        return KINDS[kind](**given)
-    except InvalidExpression as error:
-        faults.add((*path, "psi"), error.message, where, error.column)
-        return []
-
-
-@functools.cache
-def _keys(kind: str) -> Mapping[str, inspect.Parameter]:
-    """The parameters of the factory of a kind, by name."""
-    return inspect.signature(KINDS[kind]).parameters
+    """The constraint at `path`, made from its mapping; see `consat.scenario.mappings.constraint`. `owner`: its agent or group in words."""
+    kind, name = (data.get("kind"), data.get("name")) if isinstance(data, dict) else (None, None)
+    known = isinstance(kind, str) and kind in KINDS
+    where = f"{owner}, constraint {repr(name if isinstance(name, str) else kind) if known else int(path[-1]) + 1}"
+    made, found = constraint(data, where, besides)
+    faults.take([replace(fault, path=(*path, *fault.path)) for fault in found])
+    return made

@@ -25,7 +25,7 @@ from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
 
 if TYPE_CHECKING:
-    from consat.robots.description import Robots
+    from consat.scenario.robots import Robots
 
 WIDTH: Final = 110
 """Lists and mappings of up to this many characters are written on one line."""

@@ -32,6 +32,11 @@ class Order(BaseModel):
     id: Number = None
     gesture: Number = None
 
+    @property
+    def subject(self) -> tuple[Any, ...] | None:
+        """What the order sets. It replaces earlier orders of the same gesture with the same subject; None if it replaces none."""
+        return None
+
 
 class Change(Order):
     """Other parameters of a constraint."""
@@ -40,6 +45,11 @@ class Change(Order):
     agent: Name
     constraint: Name
     parameters: Parameters
+
+    @property
+    def subject(self) -> tuple[Any, ...]:
+        """The parameters of the constraint."""
+        return "change", self.agent, self.constraint, *sorted(self.parameters)
 
 
 class Shape(Order):
@@ -51,6 +61,11 @@ class Shape(Order):
     center: Vector | None = None
     radius: float | None = None
 
+    @property
+    def subject(self) -> tuple[Any, ...]:
+        """Centre or radius, or both, of the ball."""
+        return "shape", self.scene, self.shape, self.center is None, self.radius is None
+
 
 class Wall(Order):
     """A half-space, by its place in the scene, further along its normal, for all whose it is."""
@@ -60,6 +75,11 @@ class Wall(Order):
     wall: Place
     offset: float
 
+    @property
+    def subject(self) -> tuple[Any, ...]:
+        """The offset of the half-space."""
+        return "wall", self.scene, self.wall
+
 
 class Put(Order):
     """A body somewhere else."""
@@ -67,6 +87,11 @@ class Put(Order):
     do: Literal["place"]
     agent: Name
     position: Vector
+
+    @property
+    def subject(self) -> tuple[Any, ...]:
+        """The position of the agent."""
+        return "place", self.agent
 
 
 class Add(Order):

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from consat.errors import Fault, InvalidTeam
-from consat.problem.family import Family
 from consat.problem.team import Team
-from consat.robots.description import Robots, obstacle_data
+from consat.scenario.robots import Robots, obstacle_data
 from consat.views import bodies, picture
 from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Shapes, moves, shapes
 
 MOST_LISTED: Final = 2000
 """Constraints that are listed for people to choose from."""
-CENTERS: Final[Mapping[str, str]] = {"within": "center", "outside": "center", "displacement": "vector"}
-"""Which parameter of a ball says where it is."""
 
 
 class Scene(NamedTuple):
@@ -101,37 +97,3 @@ class Scene(NamedTuple):
             for k, each, tie in zip(numbers.tolist(), lines, ties, strict=True)
         ]
         return json.dumps({"type": "outlines", "number": self.number, "outlines": found}, separators=(",", ":"), allow_nan=False)
-
-
-def place_of(team: Team, number: int) -> tuple[Family, int]:
-    """The family of a constraint, and its place in it."""
-    for family in team.families:
-        found = np.flatnonzero(family.number == number)
-        if len(found):
-            return family, int(found[0])
-    raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
-
-
-def named(team: Team, agent: str, constraint: str) -> list[int]:
-    """The numbers of an agent's constraint of this name, or of the sides of a box; none if there is none."""
-    ids = list(team.ids)
-    if agent not in ids:
-        return []
-    own = [int(k) for k in np.flatnonzero(team.owner == ids.index(agent))]
-    exact = [k for k in own if team.names[k] == constraint]
-    return exact or [k for k in own if team.names[k].startswith((f"{constraint}.low[", f"{constraint}.high["))]
-
-
-def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> dict[str, Any]:
-    """What some parameters of a constraint are now, schedules included, so that they can be put back."""
-    found: dict[str, Any] = {}
-    for number in numbers:
-        family, k = place_of(team, number)
-        for key in keys:
-            if key == "weight":
-                found[key] = float(family.weight[k])
-            elif key in family.parameters:
-                track = family.tracks.get(key)
-                schedule = None if track is None else track.schedule(k)
-                found[key] = np.array(family.parameters[key][k]) if schedule is None else schedule
-    return found

@@ -20,6 +20,10 @@ from consat.views.scene import Scene, moments
 
 MOVEMENT: Final = 0.75
 """Weight of the distance travelled in the time scale of a film; the rest is the clock. Most motion is in the first seconds of a run."""
+STEP: Final = 0.5
+"""Longest time that a film spends on one recorded step, if there are enough of them, s."""
+LAST: Final = 1.0
+"""Longest time that a film shows the final formation, s."""
 FINE: Final = 121
 """Grid points per axis of the view at which ψ is evaluated in a film."""
 FORMATS: Final = (".gif", ".mp4")
@@ -35,7 +39,7 @@ def save(
     Args:
         result: result of a run with recorded positions.
         path: file to write. It ends in ``.gif``, or in ``.mp4``, which needs PyAV (``consat[video]``).
-        seconds: length of the film, s. The last 10 % show the final formation.
+        seconds: length of the film, s. The end, 10 % but at most `LAST`, shows the final formation.
         fps: frames per second.
         progress: called after each frame with the fraction that is done, 0 to 1.
 
@@ -55,7 +59,7 @@ def save(
         _encoder()
     target.parent.mkdir(parents=True, exist_ok=True)
     count = max(2, round(seconds * fps))
-    shown = frames(result, count, progress)
+    shown = frames(result, count, fps, progress)
     if suffix == ".mp4":
         _mp4(target, shown, fps)
     else:
@@ -63,7 +67,7 @@ def save(
     return target
 
 
-def frames(result: Result, count: int, progress: Callable[[float], None] | None = None) -> Iterator[np.ndarray]:
+def frames(result: Result, count: int, fps: int, progress: Callable[[float], None] | None = None) -> Iterator[np.ndarray]:
     """Yield `count` frames of a film, (height, width, 3) uint8. The static background is drawn once; arguments as in `save`."""
     scene = Scene(result, fine=FINE)
     scene.figure.set_dpi(90)
@@ -78,8 +82,9 @@ def frames(result: Result, count: int, progress: Callable[[float], None] | None 
     background = canvas.copy_from_bbox(scene.figure.bbox)
     for artist in scene.moving:
         artist.set_visible(True)
-    moving = moments(scene, count - count // 10, MOVEMENT if scene.x.shape[2] > 1 else 0.0)
-    for k, moment in enumerate(np.pad(moving, (0, count // 10), "edge")):
+    held = min(count // 10, round(LAST * fps))
+    moving = moments(scene, count - held, MOVEMENT if scene.x.shape[2] > 1 else 0.0, STEP * fps / count)
+    for k, moment in enumerate(np.pad(moving, (0, held), "edge")):
         if k < len(moving):
             scene.show(moment)
             canvas.restore_region(background)

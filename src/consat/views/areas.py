@@ -54,6 +54,11 @@ class Area:
     style: Any
 
 
+def colour_of(owners: Sequence[int]) -> str:
+    """Colour of a region: that of its owner; `SHARED` for several owners."""
+    return colour(owners[0]) if len(owners) == 1 else SHARED
+
+
 def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
     """The distinct regions of a team.
 
@@ -74,10 +79,8 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
             edge = values[number][_edge(values.shape[1:])]
             keeps_out = keeps_out or bool((values[number] < 0).any() and (edge > 0).all())
             leaves = bool(not keeps_out and (edge > 0).any() and (edge < 0).any())
-        shade = colour(mine[0]) if len(mine) == 1 else SHARED
-        found.append(
-            Area(number, name, mine, keeps_out, leaves, bool(ties[number]), shade, "-" if keeps_out else STYLES[rank % len(STYLES)])
-        )
+        style = "-" if keeps_out else STYLES[rank % len(STYLES)]
+        found.append(Area(number, name, mine, keeps_out, leaves, bool(ties[number]), colour_of(mine), style))
     return found
 
 
@@ -113,9 +116,8 @@ class Ground:
                 alike_goals.setdefault(frozenset(mine[owner] & closed), []).append(owner)
         self._common: list[tuple[list[int], PathPatch]] = []
         for owners in alike_goals.values():
-            tint = colour(owners[0]) if len(owners) == 1 else SHARED
             numbers = sorted(set.intersection(*(mine[owner] for owner in owners)))
-            self._common.append((numbers, _patch(axes, "region", facecolor=tint, edgecolor="none", alpha=TINT, zorder=0.6)))
+            self._common.append((numbers, _patch(axes, "region", facecolor=colour_of(owners), edgecolor="none", alpha=TINT, zorder=0.6)))
         self._edges = [
             _patch(axes, "boundary", fill=False, edgecolor=area.colour, linestyle=area.style, **_weight(area), zorder=2) for area in found
         ]

@@ -16,13 +16,13 @@ from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from consat.results.result import Result
-from consat.robots.description import Robots
 from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
+from consat.scenario.robots import Robots
+from consat.views.space import sphere
 
 SOLID: Final = "0.62"
 """Colour of obstacles. Only obstacles are solid grey; keep-outs are hatched."""
 EDGE: Final = "0.25"
-AROUND: Final = np.linspace(0, 2 * np.pi, 25)
 SIDES: Final = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
 """(6, 4) corner numbers of each side of a box in space. Bits 4, 2, 1 of a number say whether the corner is high on axis 0, 1, 2."""
 
@@ -135,7 +135,7 @@ def map_in_space(axes: Any, found: Sequence[Obstacle]) -> None:
     """Draw obstacles of space (balls and boxes), solid grey."""
     for each in found:
         if isinstance(each, Disc):
-            axes.plot_surface(*_ball(np.array(each.center), each.radius), color=SOLID, alpha=0.9, linewidth=0, zorder=1, gid="obstacle")
+            axes.plot_surface(*sphere(np.array(each.center), each.radius), color=SOLID, alpha=0.9, linewidth=0, zorder=1, gid="obstacle")
         elif isinstance(each, Box):
             sides = np.array(np.meshgrid(*zip(each.low, each.high, strict=True), indexing="ij")).reshape(3, 8).T[SIDES]
             look: dict[str, Any] = {"facecolors": [to_rgba(SOLID, 0.85)], "edgecolors": [EDGE], "linewidths": 0.8}
@@ -145,16 +145,9 @@ def map_in_space(axes: Any, found: Sequence[Obstacle]) -> None:
 def balls(axes: Any, middle: np.ndarray, radius: np.ndarray, shades: Sequence[Any]) -> list[Artist]:
     """Draw bodies in space as balls: centres (N, 3), radii (N,), one colour each."""
     return [
-        axes.plot_surface(*_ball(at, size), color=shade, linewidth=0, zorder=4, gid="body")
+        axes.plot_surface(*sphere(at, size), color=shade, linewidth=0, zorder=4, gid="body")
         for at, size, shade in zip(middle, radius, shades, strict=True)
     ]
-
-
-def _ball(center: np.ndarray, radius: float) -> np.ndarray:
-    """(3, K, L) grid of points on a sphere."""
-    longitude, latitude = np.meshgrid(AROUND, AROUND[: len(AROUND) // 2 + 1], indexing="ij")
-    sphere = np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
-    return np.asarray(center[:, None, None] + radius * sphere)
 
 
 class Crew:

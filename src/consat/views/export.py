@@ -16,12 +16,16 @@ Progress = Callable[[float], None]
 
 
 def _csv(result: Result, target: Path, progress: Progress | None) -> None:
-    """A row for each agent at each recorded time or round: where it is, and its margin; empty without constraints."""
+    """One row per agent and recorded time or round: the time in s if rounds have a duration, position, and margin, empty if infinite."""
     import xarray as xr
+
+    from consat.views.figures import period, seconds
 
     data = result.data
     clock = str(data["position"].dims[0])
     columns = {str(axis): data["position"].sel(axis=axis, drop=True) for axis in data["axis"].values}
+    if clock != "time" and period(result) is not None:
+        columns = {"time": data[clock].copy(data=seconds(result, data[clock].values)), **columns}
     table = xr.Dataset({**columns, "margin": data["agent_margin"].where(np.isfinite(data["agent_margin"]))})
     table = table.drop_vars([name for name in table.coords if name not in (clock, "agent")])
     table.to_dataframe(dim_order=[clock, "agent"]).to_csv(target)

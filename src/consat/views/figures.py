@@ -28,6 +28,7 @@ from consat.numerics import float64
 from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.results.result import Result
+from consat.views.words import typeset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -207,12 +208,12 @@ def margins(result: Result) -> Figure:
     verdicts = summary.get("verdicts")
     lower, upper = (summary.get("bounds") or (None, None)) if not verdicts else (None, None)  # of moving constraints: the end only
     if lower is not None and upper is not None:
-        proven = number(lower) if number(lower) == number(upper) else f"{number(lower)} to {number(upper)}"
+        proven = typeset(lower) if typeset(lower) == typeset(upper) else f"{typeset(lower)} to {typeset(upper)}"
         axes.axhspan(lower, upper, color=COLOURS[2], alpha=0.25, label=f"best possible margin, proven: {proven}")
     since = summary["satisfied_from"]["time" if clock == "time" else "round"]
     if since is not None:
         axes.axvline(since, color=COLOURS[3], linewidth=1.5, linestyle=":")
-        label = f"satisfied from t = {number(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
+        label = f"satisfied from t = {typeset(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
         late = since > np.mean(axes.get_xlim())
         axes.text(since, 0.06, f" {label} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
     entries = [*axes.get_legend_handles_labels()[0], *(_band(axes, verdicts) if verdicts else ())]
@@ -284,11 +285,6 @@ def period(result: Result) -> float | None:
 def label(what: str, unit: str | None) -> str:
     """Label of an axis: the quantity, and the unit if there is one."""
     return what if unit is None else f"{what} [{plain(unit)}]"
-
-
-def number(value: float) -> str:
-    """Format a number for display: three digits, an integer from 1000 to 10⁶, and a true minus sign."""
-    return (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
 
 
 def estimates(result: Result) -> Figure | None:

@@ -29,9 +29,7 @@ CELL: Final = "text-align:left;padding:2px 12px 2px 0;vertical-align:top"
 
 
 def _said(value: float | None) -> str:
-    from consat.views.figures import number
-
-    return "–" if value is None or not np.isfinite(value) else number(value)
+    return words.typeset(None if value is None or not np.isfinite(value) else value, "–")
 
 
 def _place(position: Sequence[float | None]) -> str:
@@ -147,7 +145,7 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
         centers = balls.at(places)
         for k in np.flatnonzero(balls.around < 0):
             owners, radius = balls.owners[k], balls.radius[k]
-            shade = colour(owners[0]) if len(owners) == 1 and found.count <= MOST_ROWS else colours.AREA
+            shade = areas.colour_of(owners) if found.count <= MOST_ROWS else colours.AREA
             style = areas.keep_out_style(areas.SHARED) if balls.keeps_out[k] else {"facecolor": shade, "alpha": 0.15}
             axes.add_patch(Circle(tuple(centers[k]), radius, **style))
             axes.add_patch(Circle(tuple(centers[k]), radius, fill=False, edgecolor=areas.SHARED if balls.keeps_out[k] else shade))

@@ -24,13 +24,13 @@ from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.robots.description import obstacle_data
+from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
-from consat.views.figures import number, period, recorded, seconds
+from consat.views.figures import period, recorded, seconds
 from consat.views.outlines import MOST, outlines
 from consat.views.picture import FEW, MOST_SHAPES
-from consat.views.shapes import Balls, moves, shapes
+from consat.views.shapes import Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
@@ -79,7 +79,7 @@ def page(result: Result) -> str:
         "tone": "good" if good else "bad",
         "sign": "✓" if good else "✗",
         "status": escape(words.STATUS[status]),
-        "chart": escape(f"at the end {_said(summary['margin'])}"),
+        "chart": escape(f"at the end {words.typeset(summary['margin'])}"),
         "agents": counted(count, "agent") if few else f"{counted(count, 'agent')}, the tightest first",
         "scale": "" if few else _scale(result),
         "scale_hidden": "hidden" if few else "",
@@ -94,22 +94,16 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _said(value: float | None) -> str:
-    return "none" if value is None else number(value)
-
-
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
     summary = result.summary
     yield "verdict", words.VERDICT[summary["verdict"]]
     lower, upper = summary.get("bounds") or (None, None)
     if lower is not None and upper is not None:
-        yield (
-            "best possible",
-            f"{number(lower)} to {number(upper)}, proven" if number(lower) != number(upper) else f"{number(lower)}, proven",
-        )
+        ends = dict.fromkeys(map(words.typeset, (lower, upper)))  # one, if they look alike
+        yield "best possible", f"{' to '.join(ends)}, proven"
     since = summary["satisfied_from"]
     if since["time"] is not None:
-        yield "satisfied from", f"t = {number(since['time'])} s"
+        yield "satisfied from", f"t = {words.typeset(since['time'])} s"
     elif since["round"] is not None:
         yield "satisfied from", f"round {since['round']:.0f}"
     yield "protocol", f"{summary['protocol']}, {summary['estimates']} estimates, seed {summary['seed']}"
@@ -126,7 +120,9 @@ def _scale(result: Result) -> str:
     palette, edges = _palette(result)
     wide = 100 / len(palette)
     bars = "".join(f'<rect x="{wide * k:.2f}%" y="0" width="{wide:.2f}%" height="14" fill="{shade}"/>' for k, shade in enumerate(palette))
-    texts = "".join(f'<text x="{wide * (k + 1):.2f}%" y="27" text-anchor="middle">{number(edge)}</text>' for k, edge in enumerate(edges))
+    texts = "".join(
+        f'<text x="{wide * (k + 1):.2f}%" y="27" text-anchor="middle">{words.typeset(edge)}</text>' for k, edge in enumerate(edges)
+    )
     return f'<h2>margin (red: violated)</h2><svg role="img" aria-label="Colours of margins, from violated to satisfied">{bars}{texts}</svg>'
 
 
@@ -230,30 +226,57 @@ def _regions(
     found = shapes(team, times[-1])
     balls, walls = picture.constraints_of(team, found)
     moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
-    seen = [shapes(team, times[moment]).balls for moment in moments]
+    seen = [shapes(team, times[moment]) for moment in moments]
+    ties = moves(team)
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
-            {**ball, "track": _track(moments, seen, k) if seen and found.balls.moves[k] else None}
+            {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
             for k, ball in enumerate(picture.balls_of(team, found, balls))
         ],
-        "walls": picture.walls_of(team, found.walls, walls, low, high),
+        "walls": _walls(team, [*seen, found], walls, ties[found.walls.number], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
     return low, high, told
 
 
 def _moments(x: np.ndarray) -> np.ndarray:
-    """Samples at which moving regions are told."""
+    """Samples at which moving regions are written."""
     return np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int))
 
 
-def _track(moments: np.ndarray, seen: Sequence[Balls], k: int) -> Mapping[str, Any]:
-    """Where a ball is at some samples; between them it moves evenly."""
+def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
+    """Centre and radius of ball k at some samples. The page interpolates between them."""
     return {
         "at": moments.tolist(),
-        "center": [np.round(balls.center[k], 6).tolist() for balls in seen],
-        "radius": [round(float(balls.radius[k]), 6) for balls in seen],
+        "center": [np.round(each.balls.center[k], 6).tolist() for each in seen],
+        "radius": [round(float(each.balls.radius[k]), 6) for each in seen],
     }
+
+
+def _walls(
+    team: Team, seen: Sequence[Shapes], members: list[list[int]], ties: np.ndarray, moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]
+) -> list[Mapping[str, Any]]:
+    """The half-spaces, those that move with their corners and normals at some samples; without corners where they are out of view.
+
+    Args:
+        team: the team.
+        seen: its geometry at the samples, and, as the last, at the end.
+        members: from `picture.constraints_of`.
+        ties: (K,) whether each half-space moves.
+        moments: the samples.
+        box: lower and upper corner of the view.
+    """
+    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, members, *box)} for each in seen)
+    found: list[Mapping[str, Any]] = []
+    for k, moving in enumerate(ties.tolist()):
+        known = [each[k] for each in (*before, last) if k in each]
+        if not known or not (moving and before):
+            found += known[-1:]
+            continue
+        normals = [np.round(each.walls.normal[k], 6).tolist() for each in seen[:-1]]
+        corners = [each[k]["corners"] if k in each else [] for each in before]
+        found.append({**known[-1], "track": {"at": moments.tolist(), "corners": corners, "normal": normals}})
+    return found
 
 
 def _outlines(

@@ -26,8 +26,9 @@ from consat.results.result import Result
 from consat.views import areas, bodies, space
 from consat.views.areas import SHARED, Area, Ground
 from consat.views.colours import AREA, LINK, TRAIL, classes
-from consat.views.figures import GREY, colour, grid, label, marker, number, period, plain, recorded, regions, seconds, view
+from consat.views.figures import GREY, colour, grid, label, marker, period, plain, recorded, regions, seconds, view
 from consat.views.shapes import Shapes, boxes, moves, shapes, ways
+from consat.views.words import typeset
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
 MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
@@ -245,7 +246,7 @@ class Scene:
         place: dict[str, Any] = {"pad": 0.12, "shrink": 0.75} if self._space else {"pad": 0.03}
         place |= {"label": r"agent margin $\barα_i$ (red: violated)", "ticks": edges, "spacing": "uniform", "extend": extend}
         bar = self.figure.colorbar(self._colours, ax=self.axes, **place)
-        bar.ax.set_yticklabels([number(edge) for edge in edges])
+        bar.ax.set_yticklabels([typeset(edge) for edge in edges])
         line = functools.partial(Line2D, [], [])
         lines: list[Any] = [line(marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")]
         if self._robots is not None:
@@ -366,7 +367,7 @@ class Scene:
         clock = f"{_between(self.steps, moment)[0]:.1f}".removesuffix(".0")
         time = f"t = {clock} s" if self._clock == "time" else f"round {self.steps[sample]:.0f}"
         notes = [*self._sample, *["starts out of view"] * self._cut] + [f"the first two of {self.x.shape[2]} axes"] * (self.x.shape[2] > 3)
-        margin = f", margin {number(self._margin[sample])}" if np.isfinite(self._margin[sample]) else ""
+        margin = f", margin {typeset(self._margin[sample])}" if np.isfinite(self._margin[sample]) else ""
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 
     def _move(self, trail: np.ndarray, moment: float) -> None:
@@ -510,9 +511,20 @@ def _joined(segments: np.ndarray) -> np.ndarray:
     return np.concatenate([segments, np.full_like(segments[:, :1], np.nan)], axis=1).reshape(-1, segments.shape[2]).T
 
 
-def moments(scene: Scene, count: int, movement: float) -> np.ndarray:
-    """(count,) moments from start to end, spaced by a mean of distance travelled (weight `movement`, 0 to 1) and clock."""
+def moments(scene: Scene, count: int, movement: float, longest: float = 1.0) -> np.ndarray:
+    """Moments from start to end, (count,), spaced by a mean of distance travelled and clock.
+
+    Args:
+        scene: the scene.
+        count: number of moments.
+        movement: weight of the distance, 0 to 1.
+        longest: largest share of the moments within one recorded step, if there are enough steps.
+    """
     x, clock = scene.x[: scene.last + 1], scene.steps[: scene.last + 1] - float(scene.steps[0])
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
     share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
+    steps, longest = np.diff(share), max(longest, 1.2 / max(1, len(share) - 1))
+    while steps.sum() > 0 and steps.max() > 1.01 * longest * steps.sum():
+        steps = np.minimum(steps, longest * steps.sum())
+    share = np.append(0.0, np.cumsum(steps))
     return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from consat.problem.team import Team
-from consat.views.areas import SHARED
+from consat.views.areas import SHARED, colour_of
 from consat.views.figures import colour, grid, regions
 from consat.views.shapes import Balls, Shapes, Walls
 
@@ -24,14 +24,11 @@ SECTION: Final = 61
 FLOOR: Final = "0.55"
 
 
-def _sphere(around: int, down: int) -> np.ndarray:
-    """(3, around, down) grid of points on the unit sphere."""
+def sphere(center: np.ndarray, radius: float, around: int = 25, down: int = 13) -> np.ndarray:
+    """(3, around, down) grid of points on a sphere."""
     longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, around), np.linspace(0, np.pi, down), indexing="ij")
-    return np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
-
-
-def _shade(owners: Sequence[int]) -> str:
-    return colour(owners[0]) if len(owners) == 1 else SHARED
+    unit = np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)])
+    return np.asarray(center[:, None, None] + radius * unit)
 
 
 def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: Any = None) -> Iterator[Artist]:
@@ -48,12 +45,12 @@ def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: A
     angle = np.linspace(0, 2 * np.pi, 25 if many else 49)
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     rings = np.stack([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
-    surface, centers = _sphere(*((13, 7) if many else (25, 13))), found.at(x)
+    fineness, centers = (13, 7) if many else (25, 13), found.at(x)
     for k in chosen:
         solid, center, radius = bool(found.keeps_out[k]), centers[k], found.radius[k]
-        shade = _shade(found.owners[k]) if goal is None else SHARED if solid else goal
+        shade = colour_of(found.owners[k]) if goal is None else SHARED if solid else goal
         yield axes.plot_surface(
-            *(center[:, None, None] + radius * surface),
+            *sphere(center, radius, *fineness),
             color=SHARED if solid else shade,
             alpha=0.45 if solid else 0.07,
             linewidth=0,
@@ -70,7 +67,7 @@ def balls(axes: Any, found: Balls, x: np.ndarray, chosen: Sequence[int], goal: A
 def walls(axes: Any, found: Walls, low: np.ndarray, high: np.ndarray) -> Iterator[Artist]:
     """Draw the boundaries of half-spaces within the view. Those of the same owners cut each other, so that sides form a box."""
     for k, corners in faces(found, low, high):
-        shade = _shade(found.owners[k])
+        shade = colour_of(found.owners[k])
         look: dict[str, Any] = {"facecolors": [to_rgba(shade, 0.08)], "edgecolors": [to_rgba(shade, 0.8)], "linewidths": 1.0}
         face = Poly3DCollection([corners], **look, gid="region", zorder=0.4)
         yield axes.add_collection3d(face, autolim=False)

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from consat.errors import counted
-from consat.views.words import ROUTE, VERDICT
+from consat.views.words import ROUTE, VERDICT, number
 
 MOST_ROWS = 30
 """Most rows of a table. Of longer lists the beginning is shown."""
@@ -62,7 +62,7 @@ def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
         binding.setdefault(row["agent"], []).append((row["constraint"], row["multiplier"]))
     agents = sorted(answer["positions"], key=lambda agent: -max((m for _, m in binding.get(agent, [])), default=0.0))
     for agent in agents[:MOST_ROWS]:
-        position = "(" + ", ".join(_number(x) for x in answer["positions"][agent]) + ")"
+        position = "(" + ", ".join(number(x, 6) for x in answer["positions"][agent]) + ")"
         names, values = zip(*binding.get(agent, [("", None)]), strict=True)
         table.add_row(escape(agent), position, escape("\n".join(names)), "\n".join("" if v is None else f"{v:.3f}" for v in values))
     yield table
@@ -78,9 +78,9 @@ def _best(answer: Mapping[str, Any]) -> str:
     if answer["margin"] is None:
         return "best margin unbounded"
     if answer["proven"]:
-        return f"best margin {_number(answer['margin'])}, proven: none is better"
-    return f"best margin found {_number(answer['margin'])}; " + (
-        "no upper bound is proven" if upper is None else f"proven: none is better than {_number(upper)}"
+        return f"best margin {number(answer['margin'], 6)}, proven: none is better"
+    return f"best margin found {number(answer['margin'], 6)}; " + (
+        "no upper bound is proven" if upper is None else f"proven: none is better than {number(upper, 6)}"
     )
 
 
@@ -115,7 +115,3 @@ def _table(*columns: str) -> Table:
     for column in columns:
         table.add_column(column, overflow="fold")
     return table
-
-
-def _number(value: float | None) -> str:
-    return "unbounded" if value is None else f"{value:.6g}"

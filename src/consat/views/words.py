@@ -68,17 +68,17 @@ def sweep(summary: Mapping[str, Any]) -> str:
     lines = [f"{summary['scenario']}: {counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"]
     for group in summary["groups"]:
         named = ", ".join(f"{path} = {value}" for path, value in group["values"].items()) or "all"
-        since, margin = ("none" if group[k] is None else _number(group[k]["mean"]) for k in ("satisfied_from", "margin"))
+        since, margin = ("none" if group[k] is None else number(group[k]["mean"]) for k in ("satisfied_from", "margin"))
         lines.append(f"  {named}: {group['success']:.1%} satisfied, from {since} on the mean; margin {margin} on the mean")
     return "\n".join(lines)
 
 
 def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "verdict", VERDICT[summary["verdict"]]
-    yield "margin", f"{_number(summary['margin'])} (smooth margin {_number(summary['smooth_margin'])})"
+    yield "margin", f"{number(summary['margin'])} (smooth margin {number(summary['smooth_margin'])})"
     lower, upper = summary.get("bounds") or (None, None)
     if lower is not None and upper is not None:
-        yield "best possible", f"between {_number(lower)} and {_number(upper)}, proven"
+        yield "best possible", f"between {number(lower)} and {number(upper)}, proven"
     restarts = summary.get("restarts")
     if restarts is not None:
         yield "best of", f"{counted(restarts['count'], 'start')}; {restarts['satisfied']} of them end with every constraint satisfied"
@@ -86,7 +86,7 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "violation", "the least found, not proven to be the least possible"
     since = summary["satisfied_from"]
     if since["time"] is not None:
-        yield "satisfied from", f"t = {_number(since['time'])} s"
+        yield "satisfied from", f"t = {number(since['time'])} s"
     elif since["round"] is not None:
         yield "satisfied from", f"round {since['round']:.0f}"
     else:
@@ -106,7 +106,7 @@ def _outcome(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _when(summary: Mapping[str, Any]) -> str:
     since = summary["known_from"]
-    return f"round {since:.0f}" if summary.get("rounds") is not None else f"t = {_number(since)} s"
+    return f"round {since:.0f}" if summary.get("rounds") is not None else f"t = {number(since)} s"
 
 
 def motion(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -123,7 +123,7 @@ def over_time(summary: Mapping[str, Any]) -> str:
     verdicts = summary["verdicts"]
     duration = verdicts[-1]["to"]
     told = [each for each in verdicts if each["verdict"] != "undecided" or each["to"] - each["from"] >= SLIGHT * duration]
-    spans = [f"{each['verdict']} from {_number(each['from'])} to {_number(each['to'])} s" for each in told[:MOST_INTERVALS]]
+    spans = [f"{each['verdict']} from {number(each['from'])} to {number(each['to'])} s" for each in told[:MOST_INTERVALS]]
     left = len(told) - len(spans)
     return "; ".join(spans) + (f"; and {left} more intervals" if left else "")
 
@@ -138,7 +138,7 @@ def kept_up(summary: Mapping[str, Any]) -> str:
     later = motion["satisfied_share"] / share  # both count the same satisfied rounds: the ratio is the share of later rounds
     before = (1 - later) * (rounds + 1) / max(rounds, 1) * duration
     told = "at all times" if share == 1 else f"for {math.floor(1000 * share) / 10:g} % of the time"
-    return f"every constraint held {told} after t = {_number(before)} s; worst margin {_number(motion['worst_margin_after'])}"
+    return f"every constraint held {told} after t = {number(before)} s; worst margin {number(motion['worst_margin_after'])}"
 
 
 def bodies(summary: Mapping[str, Any]) -> str:
@@ -146,8 +146,8 @@ def bodies(summary: Mapping[str, Any]) -> str:
     motion = summary["motion"]
     gap, clear, contacts = (motion[key] for key in ("smallest_distance", "clearance", "contacts"))
     told = ["nobody touched" if not contacts else counted(contacts, "pair", "pairs") + " touched"]
-    near = [f"{_number(gap)} m apart at least"] if gap is not None else []
-    near += [f"{_number(clear)} m from obstacles"] if clear is not None else []
+    near = [f"{number(gap)} m apart at least"] if gap is not None else []
+    near += [f"{number(clear)} m from obstacles"] if clear is not None else []
     told += [", ".join(near)] if near else []
     told += [f"bodies and contacts by {simulator}"] if (simulator := motion.get("simulator")) else []
     stuck = [_short(agent) for agent in motion["stuck"]]
@@ -203,7 +203,7 @@ def _effort(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     )  # fmt: skip
     effort = [counted(summary[key], *unit) for key, *unit in units if summary.get(key) is not None]
     if summary.get("time") is not None:
-        effort.insert(0, f"until t = {_number(summary['time'])} s")
+        effort.insert(0, f"until t = {number(summary['time'])} s")
     if effort:
         yield "effort", ", ".join(effort)
 
@@ -228,13 +228,13 @@ def _who(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         margins = sorted((entry["margin"], agent) for agent, entry in agents.items() if entry["margin"] is not None)
         yield (
             "agents",
-            f"{len(agents):,}; the tightest: " + ", ".join(f"{_short(agent)} ({_number(margin)})" for margin, agent in margins[:3]),
+            f"{len(agents):,}; the tightest: " + ", ".join(f"{_short(agent)} ({number(margin)})" for margin, agent in margins[:3]),
         )
         return
     width = max(len(_short(agent)) for agent in agents)
     places = _places(list(positions.values()))
     for k, (agent, entry) in enumerate(agents.items()):
-        own = f"margin {_number(entry['margin'])}" if entry["constraints"] else "no constraints"
+        own = f"margin {number(entry['margin'])}" if entry["constraints"] else "no constraints"
         yield "" if k else "positions", f"{_short(agent):<{width}}  {places[k]}  {own}"
 
 
@@ -242,7 +242,7 @@ def _places(positions: Sequence[Sequence[float | None]]) -> list[str]:
     """Positions as aligned columns. The number of decimals depends on the largest coordinate."""
     largest = max((abs(x) for position in positions for x in position if x is not None), default=0.0)
     if largest and not 1e-3 <= largest < 1e6:
-        texts = [[_number(x) for x in position] for position in positions]
+        texts = [[number(x) for x in position] for position in positions]
     else:
         decimals = 3 - math.floor(math.log10(largest)) if 0 < largest < 1e3 else 0
         texts = [["none" if x is None else f"{round(x, decimals) + 0.0:.{decimals}f}" for x in position] for position in positions]
@@ -250,8 +250,14 @@ def _places(positions: Sequence[Sequence[float | None]]) -> list[str]:
     return ["(" + ", ".join(f"{text:>{width}}" for text in row[:MOST_AXES]) + (", ...)" if len(row) > MOST_AXES else ")") for row in texts]
 
 
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
+def number(value: float | None, digits: int = 4, missing: str = "none") -> str:
+    """A number as text of the terminal; `missing` for None."""
+    return missing if value is None else f"{value:.{digits}g}"
+
+
+def typeset(value: float | None, missing: str = "none") -> str:
+    """A number as text of figures and pages: three digits, an integer from 1000 to 10⁶, a true minus sign; `missing` for None."""
+    return missing if value is None else (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
 
 
 def _short(name: str) -> str:

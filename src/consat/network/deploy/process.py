@@ -37,7 +37,7 @@ from consat.network.node.pilot import RobotBody
 from consat.network.node.station import Station
 from consat.network.transports import Transport
 from consat.network.transports.faults import FaultyTransport
-from consat.robots.description import asked
+from consat.scenario.robots import asked
 
 NAP: Final = 0.05
 """Longest wait, s, so that signals and orders are noticed soon."""

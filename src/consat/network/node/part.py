@@ -24,9 +24,9 @@ from consat.numerics import float64
 from consat.problem.family import Family
 from consat.problem.objective import Nu
 from consat.problem.team import Agent, Team
-from consat.robots.description import Robots
 from consat.scenario import Scenario, dump
 from consat.scenario.document import LARGEST, Document, decode, read
+from consat.scenario.robots import Robots
 from consat.scenario.schema import build
 from consat.scenario.writing import write
 from consat.settings import Gain, Model, Number, Settings, Smoothing

@@ -20,11 +20,11 @@ from consat.network.node.body import MeasuredBody, Measurement
 from consat.numerics import on_device, quick_compilation
 from consat.robots import Drive, Planner, Unicycle, deadlock
 from consat.robots import filter as safety
-from consat.robots.description import Robots, kind_of
 from consat.robots.model import LARGEST, along
 from consat.robots.neighbours import candidates, near
 from consat.robots.point import Point
 from consat.robots.unicycle import UnicycleState
+from consat.scenario.robots import Robots, kind_of
 
 HELD: Final = 0.2
 """Validity of a command, s, which the filter checks: twice the time between two commands."""

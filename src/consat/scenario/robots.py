@@ -1,9 +1,8 @@
-"""Which robots a team has, and on which map, as a scenario says it and as `consat.run` takes it."""
+"""The robots of a team and the obstacles on its map, from a scenario or from the arguments of `consat.run`."""
 
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -18,6 +17,7 @@ from consat.robots.obstacles import Obstacle, box, disc, polygon
 from consat.robots.point import Point
 from consat.robots.quadrotor import Quadrotor
 from consat.robots.unicycle import Unicycle
+from consat.scenario.mappings import checked
 
 KINDS: Final[Mapping[str, Any]] = {"point": Point, "double": Double, "unicycle": Unicycle, "quadrotor": Quadrotor}
 """What ``kind:`` may say of robots; the other keys are the arguments of the model."""
@@ -151,25 +151,15 @@ def obstacle_of(data: Any, where: str = "obstacle") -> Obstacle:
 
 
 def _made(data: Any, kinds: Mapping[str, Any], where: str, example: str, base: Mapping[str, Any] | None) -> Any:
-    if not isinstance(data, Mapping):
-        raise InvalidInput([Fault((), f"it is {shown(data)}, but must be a mapping such as {example}", where)])
-    kind = data.get("kind", None if base is None else base.get("kind"))
-    if kind is None:
-        raise InvalidInput([Fault(("kind",), f"kind is missing; it is one of {', '.join(kinds)}", where)])
-    if not isinstance(kind, str) or kind not in kinds:
-        message = f"there is no kind {shown(kind)}; the kinds are {', '.join(kinds)}{closest(kind, kinds)}"
-        raise InvalidInput([Fault(("kind",), message, where)])
-    keys = list(inspect.signature(kinds[kind]).parameters)
-    if unknown := [key for key in data if key != "kind" and key not in keys]:
-        raise InvalidInput([
-            Fault((key,), f"unknown key {key!r}{closest(key, keys)}; {kind} has {', '.join(keys)}", where) for key in unknown
-        ])  # fmt: skip
-    needed = [name for name, each in inspect.signature(kinds[kind]).parameters.items() if each.default is each.empty]
-    if missing := [name for name in needed if name not in data]:
-        raise InvalidInput([Fault((missing[0],), f"{missing[0]} is missing; {kind} needs {', '.join(needed)}", where)])
-    inherited = {} if base is None or base.get("kind") != kind else {key: value for key, value in base.items() if key != "kind"}
+    inherited: dict[str, Any] = {}
+    if isinstance(data, Mapping) and base is not None:
+        data = {"kind": base.get("kind"), **data}
+        inherited = {key: value for key, value in base.items() if key != "kind"} if data["kind"] == base.get("kind") else {}
+    given, faults = checked(data, kinds, where, example, base=inherited)
+    if faults:
+        raise InvalidInput(faults)
     try:
-        return kinds[kind](**{**inherited, **{key: value for key, value in data.items() if key != "kind"}})
+        return kinds[data["kind"]](**inherited | given)
     except InvalidInput as error:
         named = [f"{where}, {fault.path[0]}" if fault.path else where for fault in error.faults]
         raise InvalidInput(dataclasses.replace(fault, where=each) for fault, each in zip(error.faults, named, strict=True)) from None

@@ -1,0 +1,98 @@
+"""Which constraints, with which parameters, an order about a shape of the scene changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from consat.errors import Fault, InvalidTeam
+from consat.problem.family import Family
+from consat.problem.team import Team
+
+CENTERS: Final[Mapping[str, str]] = {"within": "center", "outside": "center", "displacement": "vector"}
+"""The parameter that holds the centre of a ball, by kind."""
+MOST_SHARED: Final = 64
+"""Most constraints that one order can change."""
+
+
+class Target(NamedTuple):
+    """A constraint to change.
+
+    Attributes:
+        agent: id of its owner.
+        name: name of the constraint, or of the box that it is a side of.
+        numbers: its indices in the team; those of a box are its sides.
+    """
+
+    agent: str
+    name: str
+    numbers: list[int]
+
+
+def ball(
+    team: Team, numbers: list[int], center: Sequence[float] | None, radius: float | None
+) -> tuple[list[Target], dict[str, Any]]:  # fmt: skip
+    """The constraints that share a ball, and their parameters for another centre or radius; None leaves it."""
+    family, _ = place_of(team, numbers[0])
+    parameters: dict[str, Any] = {} if radius is None else {"radius": radius}
+    if center is not None:
+        if family.kind not in CENTERS:
+            raise InvalidTeam([Fault((), f"{family.kind} has no centre of its own; change its radius", "shape")])
+        parameters[CENTERS[family.kind]] = center
+    return _targets(team, numbers), parameters
+
+
+def wall(team: Team, numbers: list[int], offset: float) -> tuple[list[Target], dict[str, Any]]:
+    """The constraints that share a half-space, and their parameters for another offset along its unit normal."""
+    family, k = place_of(team, numbers[0])
+    given = {key: value[k] for key, value in family.parameters.items()}
+    targets = _targets(team, numbers)
+    if "normal" in given:
+        return targets, {"offset": offset * float(np.linalg.norm(given["normal"]))}
+    side, sign = ("high", 1.0) if "high" in given else ("low", -1.0)
+    boxes = [each._replace(name=each.name.rpartition(f".{side}[")[0]) for each in targets]
+    corner = parameters_of(team, named(team, boxes[0].agent, boxes[0].name), [side])[side]
+    return boxes, {side: np.where(np.asarray(given["axis"]) > 0, sign * offset, corner).tolist()}
+
+
+def _targets(team: Team, numbers: list[int]) -> list[Target]:
+    if len(numbers) > MOST_SHARED:
+        message = f"{len(numbers)} agents share it, but at most {MOST_SHARED} can be changed together while the team lives"
+        raise InvalidTeam([Fault((), message, "shape")])
+    return [Target(team.ids[team.owner[number]], team.names[number], [number]) for number in numbers]
+
+
+def place_of(team: Team, number: int) -> tuple[Family, int]:
+    """The family of a constraint, and its place in it."""
+    for family in team.families:
+        found = np.flatnonzero(family.number == number)
+        if len(found):
+            return family, int(found[0])
+    raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
+
+
+def named(team: Team, agent: str, constraint: str) -> list[int]:
+    """The numbers of an agent's constraint of this name, or of the sides of a box; none if there is none."""
+    ids = list(team.ids)
+    if agent not in ids:
+        return []
+    own = [int(k) for k in np.flatnonzero(team.owner == ids.index(agent))]
+    exact = [k for k in own if team.names[k] == constraint]
+    return exact or [k for k in own if team.names[k].startswith((f"{constraint}.low[", f"{constraint}.high["))]
+
+
+def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> dict[str, Any]:
+    """What some parameters of a constraint are now, schedules included, so that they can be put back."""
+    found: dict[str, Any] = {}
+    for number in numbers:
+        family, k = place_of(team, number)
+        for key in keys:
+            if key == "weight":
+                found[key] = float(family.weight[k])
+            elif key in family.parameters:
+                track = family.tracks.get(key)
+                schedule = None if track is None else track.schedule(k)
+                found[key] = np.array(family.parameters[key][k]) if schedule is None else schedule
+    return found
