@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,8 +18,9 @@ from consat.problem.graphs import clusters
 from consat.problem.objective import Objective
 from consat.problem.units import scale
 from consat.protocols.interior_point import InteriorPoint
-from consat.protocols.local.interior import Interior, route_of
+from consat.protocols.local.interior import Interior, Memory, route_of
 from consat.protocols.local.interior.algebra import LOOPED, gram, reduced, solve, spread
+from consat.protocols.local.interior.prediction import observed, predicted
 from tests.unit.teams import MARGINS, case
 
 
@@ -278,3 +280,24 @@ def test_a_proof_speaks_of_wherever_constraints_lead() -> None:
     for _ in range(60):
         assert session.step().known != "infeasible"
     assert session.satisfied
+
+
+def test_copies_that_move_steadily_are_predicted_and_others_are_not():
+    end = 1.98
+    lanes = SimpleNamespace(
+        any_moves=True,
+        moves=jnp.array([True, True, False, True]),
+        used=jnp.ones((1, 4), bool),
+        psi=lambda y: jnp.where(y[:1, 0] < jnp.array([[jnp.inf, jnp.inf, jnp.inf, end]]), 1.0, -jnp.inf),
+    )
+    zero = jnp.zeros(4)
+    memory = Memory(jnp.zeros((1, 2, 4)), jnp.zeros((1, 2, 4)), jnp.zeros((0, 4)), *[zero] * (len(Memory._fields) - 3))
+    steps = np.array([[[0.04, 0.04, 0.04, 0.04], [0.03, 0.03, 0.03, 0.03]]])
+    for k in range(49):  # the second lane goes to and fro; the fourth has come to where its ψ ends
+        assert k > 10 or (predicted(lanes, memory) == memory.y).all()
+        there = memory.y + steps * np.array([1.0, (-1.0) ** k, 1.0, 1.0])
+        memory = memory._replace(y=there, age=memory.age + 1, **observed(lanes, memory, there))
+    moved = np.asarray(predicted(lanes, memory) - memory.y)[0]
+    np.testing.assert_allclose(moved[:, 0], [0.04, 0.03], rtol=0.05)
+    np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-3)
+    np.testing.assert_array_equal(moved[:, 2:], 0.0)

@@ -92,7 +92,7 @@ class InteriorPoint:
     name: str = "interior-point"
     speaks: ClassVar[str] = "pair"
     per: ClassVar[Mapping[str, Any]] = {
-        "memory": {"y": "row", "multiplier": "constraint", **dict.fromkeys(Memory._fields[2:], "agent")},
+        "memory": {"y": "row", "drift": "row", "multiplier": "constraint", **dict.fromkeys(Memory._fields[3:], "agent")},
         "inbox": "pair",
     }
 

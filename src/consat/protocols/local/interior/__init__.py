@@ -110,7 +110,8 @@ class Interior:
         def turn(batch: Batch) -> tuple[Memory, Mail]:
             agents, rows, ends, shared = batch.agents[0], batch.rows[0], batch.pairs[0], batch.shared[0]
             multiplier = taken(memory.multiplier, batch.members[0], 0.0)
-            mine = Memory(jnp.moveaxis(taken(y, rows, 0.0), 1, -1), multiplier, *(leaf[agents] for leaf in memory[2:]))
+            copies, drift = (jnp.moveaxis(taken(each, rows, 0.0), 1, -1) for each in (y, memory.drift))
+            mine = Memory(copies, drift, multiplier, *(leaf[agents] for leaf in memory[3:]))
             p = shared.shape[1]
 
             def at(values: Array, empty: float = 0.0) -> Array:
@@ -143,10 +144,10 @@ class Interior:
         """Gather the results of all batches in the order of the team."""
         plan = self.plan
         whole = Memory(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
-        agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "multiplier")}
+        agents = {name: pick(getattr(whole, name), plan.agent) for name in Memory._fields if name not in ("y", "drift", "multiplier")}
         x = self.units.center[None] + self.units.length * pick(whole.y, plan.row)
         multiplier = pick(whole.multiplier, plan.member) if len(whole.multiplier) else jnp.zeros(0)
-        return Memory(y=x, multiplier=multiplier, **agents)
+        return Memory(y=x, drift=pick(whole.drift, plan.row), multiplier=multiplier, **agents)
 
 
 def _normal(x: Array, units: Units) -> Array:
@@ -159,9 +160,9 @@ def _lanes(batch: Batch, units: Units, gains: Gains, exact: bool) -> Lanes:
 
 
 def _out(memory: Memory) -> Memory:
-    """Flatten the arrays of a batch: y to (n·A, d), multiplier to (m·A,); per-agent arrays stay (A,)."""
-    y = jnp.moveaxis(memory.y, -1, 1)
-    return memory._replace(y=y.reshape(-1, y.shape[-1]), multiplier=memory.multiplier.reshape(-1))
+    """Flatten the arrays of a batch: y and drift to (n·A, d), multiplier to (m·A,); per-agent arrays stay (A,)."""
+    y, drift = (jnp.moveaxis(each, -1, 1).reshape(-1, each.shape[1]) for each in (memory.y, memory.drift))
+    return memory._replace(y=y, drift=drift, multiplier=memory.multiplier.reshape(-1))
 
 
 def _widened(leaf: Array, width: int) -> Array:

@@ -70,6 +70,17 @@ class Lanes:
     exact: bool
 
     @property
+    def any_moves(self) -> bool:
+        """Whether any constraint moves with time."""
+        return any(form.moves for form in self.batch.forms)
+
+    @property
+    def moves(self) -> Array:
+        """(A,) whether an agent has constraints that move with time."""
+        moving = [kind.used.any(axis=0) for form, kind in self._each() if form.moves]
+        return jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *moving]), axis=0)
+
+    @property
     def quadratic(self) -> Array:
         """(A,) whether all ψ of an agent are quadratic."""
         others = [kind.used.any(axis=0) for form, kind in self._each() if not form.quadratic]

@@ -40,12 +40,14 @@ class Form:
         curvature: (R, arity·d) vectors v with Σ v vᵀ = the convex part of −∇²ψ for weight 1; None where it varies with the position.
         concave: whether ψ is proven concave.
         quadratic: whether it is a polynomial of degree ≤ 2.
+        moves: whether any of its parameters moves with time.
     """
 
     psi: Callable[..., Any]
     curvature: Vectors | None
     concave: bool
     quadratic: bool
+    moves: bool
 
 
 class Kind(NamedTuple):
@@ -386,14 +388,14 @@ def form_of(family: Family, dimension: int) -> Form:
     from consat.problem.constraints.curvature import Curvature, read_curvatures
 
     readings = read_curvatures(family.psi, family.arity, dimension, family.lasting, family.size)
-    found = once(readings.curvature)
+    found, moves = once(readings.curvature), bool(family.tracks)
     concave = bool(((found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)).all())
     try:
         constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
     except ValueError:
-        return Form(family.psi, None, concave, quadratic=False)
+        return Form(family.psi, None, concave, quadratic=False, moves=moves)
     if len(constant) != 1 or not np.isfinite(constant).all():
-        return Form(family.psi, None, concave, quadratic=readings.degree is not None)
+        return Form(family.psi, None, concave, quadratic=readings.degree is not None, moves=moves)
     values, vectors = np.linalg.eigh(-constant[0])
     rows = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 1e-12 * max(1e-300, np.abs(values).max(initial=0.0))].T
-    return Form(family.psi, tuple(tuple(map(float, row)) for row in rows), concave, quadratic=readings.degree is not None)
+    return Form(family.psi, tuple(tuple(map(float, row)) for row in rows), concave, quadratic=readings.degree is not None, moves=moves)

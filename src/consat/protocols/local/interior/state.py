@@ -27,7 +27,11 @@ class Memory(NamedTuple):
 
     Attributes:
         y: (n, d) copies.
+        drift: (n, d) smoothed displacement of the copies in a round, in the team's unit of length; see
+            `consat.protocols.local.interior.prediction`.
         multiplier: (m,) λ_ik; 0 where padded.
+        went: sum of the squared displacements, older ones with less weight.
+        missed: the same of their differences from `drift`.
         lid: λ of the cap.
         level: t_i.
         barrier: μ_i.
@@ -40,7 +44,10 @@ class Memory(NamedTuple):
     """
 
     y: Array
+    drift: Array
     multiplier: Array
+    went: Array
+    missed: Array
     lid: Array
     level: Array
     barrier: Array
@@ -79,10 +86,13 @@ def begin(lanes: Lanes, y: Array, gains: Gains) -> Memory:
     y = placed(lanes, y)
     psi = lanes.psi(y)
     number = jnp.zeros(y.shape[-1])
+    multiplier, lid, level, barrier = centered(lanes, psi)
     violated = (jnp.min(psi[:-1], axis=0, initial=jnp.inf) < -gains.far) & lanes.quadratic
     return Memory(
-        y, *centered(lanes, psi), number + jnp.inf, number, number + 1.0, number, jnp.where(violated, float(gains.warm), 0.0), number
-    )
+        y, jnp.zeros_like(y), multiplier, number, number, lid, level, barrier,
+        bound=number + jnp.inf, age=number, inertia=number + 1.0, swing=number, warm=jnp.where(violated, float(gains.warm), 0.0),
+        changes=number,
+    )  # fmt: skip
 
 
 def placed(lanes: Lanes, y: Array) -> Array:

@@ -13,6 +13,7 @@ from jax import Array
 
 from consat.protocols.local.interior.algebra import gram, reduced, solve, spread, times
 from consat.protocols.local.interior.lanes import Here, Lanes, number
+from consat.protocols.local.interior.prediction import observed, predicted
 from consat.protocols.local.interior.proof import Proof, prove
 from consat.protocols.local.interior.state import Gains, Memory, centered, mean
 
@@ -91,9 +92,10 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     theirs = spread(inbox.matrix, inbox.vector, shared, n * d + 1)
     lowest = jnp.min(jnp.where(inbox.barrier >= 0, inbox.level, jnp.inf), axis=0, initial=jnp.inf)
 
-    here = Here.of(lanes, memory.y)
+    began = memory._replace(y=predicted(lanes, memory))
+    here = Here.of(lanes, began.y)
     point = lowered(lanes, here, memory, lowest, gains)
-    y, level, multiplier, swing, back = moved(lanes, here, memory, point, theirs, gains)
+    y, level, multiplier, swing, back = moved(lanes, here, began, point, theirs, gains)
     inertia = jnp.clip(memory.inertia * jnp.where(back, RAISE, EASE), 1.0, HEAVIEST)
 
     here = Here.of(lanes, y)
@@ -114,7 +116,10 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
         proof,
     )
     own, lid, bound = point.multiplier[:-1], point.multiplier[-1], jnp.minimum(best, bound)
-    return Memory(y, own, lid, point.level, point.barrier, bound, memory.age + 1, inertia, swing, rest, changes), mail
+    return Memory(
+        y=y, multiplier=own, **observed(lanes, memory, y), lid=lid, level=point.level, barrier=point.barrier, bound=bound,
+        age=memory.age + 1, inertia=inertia, swing=swing, warm=rest, changes=changes,
+    ), mail  # fmt: skip
 
 
 def lowered(lanes: Lanes, here: Here, memory: Memory, lowest: Array, gains: Gains) -> Point:
