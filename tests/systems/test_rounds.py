@@ -208,6 +208,18 @@ def test_max_min_of_a_grid_of_displacements() -> None:
     _check_max_min(cs.Team(agents))
 
 
+def test_admm_satisfies_a_formation_of_a_hundred() -> None:
+    """Penalties that rise too fast freeze a large formation before it is in order; ten agents do not show it."""
+    places = range(100)
+    steps = {i: [(i - k, step) for k, step, there in ((1, [1, 0], i % 10), (10, [0, 1], i >= 10)) if there] for i in places}
+    own = {i: [cs.displacement(f"g{j}", step, 0.5) for j, step in steps[i]] for i in places}
+    own[0].append(cs.within([2, 0], 1))
+    team = cs.Team([cs.Agent(f"g{i}", own[i]) for i in places], [(f"g{j}", f"g{i}") for i in places for j, _ in steps[i]])
+    since = cs.run(team, protocol="admm", start=(-5, 5), seed=1, rounds=150).summary["satisfied_from"]["round"]
+    assert since is not None
+    assert since < 100
+
+
 def test_body_moves_no_faster_than_it_can() -> None:
     result = cs.run("case-c", rate=10, speed=0.5)
     moves = np.linalg.norm(np.diff(result.data["position"].values, axis=0), axis=-1)
