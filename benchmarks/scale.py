@@ -33,9 +33,9 @@ import numpy as np
 import consat as cs
 from consat.certify.quadratics import shape_of
 from consat.engine import round as kernel
-from consat.engine.world import World, world_of
 from consat.engine.chunks import CHUNK
 from consat.engine.flows import Problem, rate
+from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import float64, thorough_compilation
 from consat.problem.objective import Nu, SmoothingSchedule

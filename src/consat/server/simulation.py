@@ -18,9 +18,10 @@ import numpy as np
 
 from consat.errors import ConsatError, Fault, InvalidInput, InvalidTeam, closest, shown
 from consat.numerics import float64
+from consat.problem.agent import Agent
 from consat.problem.constraints import KINDS
 from consat.problem.constraints.record import OWNER, Constraint, flatten
-from consat.problem.team import Agent, Team
+from consat.problem.team import Team
 from consat.runs.preparation import robots_of, scenario_of
 from consat.runs.session import Session, assessed
 from consat.scenario import Scenario, dump

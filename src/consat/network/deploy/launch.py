@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from consat.engine.rounds import HOLD, SETTLED
+from consat.engine.rules import HOLD, SETTLED
 from consat.errors import NetworkError
 from consat.faults import Faults
 from consat.network.deploy.commands import Script, Stage, Timed, load_commands, no_commands
