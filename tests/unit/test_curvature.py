@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from consat.problem.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
-from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
+from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvatures
 from consat.problem.constraints.functions import safe_norm
 from consat.problem.constraints.node import Node
 
@@ -21,6 +21,20 @@ PARAMETERS = {"a": 2.0, "b": -0.5, "c": np.array([1.0, -2.0])}
 
 
 # ------------------------------------------------------------------------------------------------------------ library kinds
+
+
+class Reading(NamedTuple):
+    curvature: Curvature
+    strict_in: tuple[bool, ...]
+    degree: int | None
+
+
+def of_member(readings: curvature.Readings, m: int) -> Reading:
+    return Reading(readings.curvature[m], tuple(map(bool, readings.strict_in[m])), readings.degree)
+
+
+def read_curvature(psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, Any]) -> Reading:
+    return of_member(read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()}), 0)
 
 
 def _values(constraint: Any) -> dict[str, Any]:
@@ -50,7 +64,7 @@ def _values(constraint: Any) -> dict[str, Any]:
 def test_library_kind(make: Callable[[int], Any], kind: Curvature, strict_in: tuple[bool, ...], power: int | None, d: int) -> None:
     made = make(d)
     arity = len(strict_in)
-    assert read_curvature(made.psi, arity, d, _values(made)) == curvature.Reading(kind, strict_in, power)
+    assert read_curvature(made.psi, arity, d, _values(made)) == Reading(kind, strict_in, power)
     assert degree(made.psi, arity, d, _values(made)) == power
 
 
@@ -248,7 +262,7 @@ def test_members_are_read_each_for_itself() -> None:
     for psi in families:
         together = read_curvatures(psi, 2, 2, stacked)
         assert set(together.curvature) >= {CONCAVE, NOT}
-        assert [together[m] for m in range(12)] == [
+        assert [of_member(together, m) for m in range(12)] == [
             read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)
         ]
 
@@ -339,8 +353,8 @@ def test_degree_holds_for_all_parameters(psi: Callable[..., Any], expected: int 
 
 
 def test_degree_may_be_less_for_given_values() -> None:
-    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 2.0}) == curvature.Reading(STRICTLY, (True,), 2)
-    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 4.0}) == curvature.Reading(CONCAVE, (False,), None)
+    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 2.0}) == Reading(STRICTLY, (True,), 2)
+    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 4.0}) == Reading(CONCAVE, (False,), None)
 
 
 # ---------------------------------------------------------------------------------------------------------- scale and slots
