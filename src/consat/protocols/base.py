@@ -160,6 +160,10 @@ class Solver(Protocol):
         """
         ...
 
+    def gradient(self, x: Array) -> Array:
+        """(rows, d) ∇f_i at the estimates `x`, (rows, d). Where ln f_i exceeds 600, f_i counts as e^600, so that it stays finite."""
+        ...
+
     def margin(self, x: Array) -> Array:
         """(N,) ᾱ_i at the estimates `x`, (rows, d); +∞ without constraints."""
         ...

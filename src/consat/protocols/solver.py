@@ -180,6 +180,9 @@ class LocalSolver:
         near = jnp.where(idle[:, None], x, self.region.nearby(x, self.convex))
         return Footing(self.local, self.nu, self.length, self.region, self.holder, self.own).find(near)
 
+    def gradient(self, x: Array) -> Array:
+        return self.local.gradient(x, self.nu)
+
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)
 
