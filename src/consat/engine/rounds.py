@@ -51,7 +51,6 @@ def simulate_rounds(
     stop: Stop = "satisfied",
     faults: Faults | None = None,
     body: Body | None = None,
-    record: bool | None = None,
     choice: Choice | None = None,
     sink: Sink | None = None,
     checkpoint: Checkpoint | None = None,
@@ -77,7 +76,6 @@ def simulate_rounds(
             `hopeless`. ``converged``: the team is settled, or its margin is `enough`.
         faults: loss and sleep; None for none.
         body: motion of the bodies; None if they are at the estimates.
-        record: whether to record all estimates; if None, only while they are few.
         choice: what is recorded; if None, the default for the size of the team.
         sink: where to record; if None, in memory.
         checkpoint: where to save the state, and the checkpoint to resume from; None for neither.
@@ -88,7 +86,7 @@ def simulate_rounds(
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     faults = faults or Faults()
-    choice = choice or Choice.of(team, copies, estimates=record)
+    choice = choice or Choice.of(team, copies)
     most, turn = HOLD, None
     engine: Engine
     if jax.process_count() > 1:

@@ -79,8 +79,11 @@ class Readings:
     strict_in: NDArray[np.bool_]
     degree: int | None
 
-    def __len__(self) -> int:
-        return len(self.curvature)
+    @property
+    def concave(self) -> NDArray[np.bool_]:
+        """(M,) bool; (1,) if all members are known to be alike."""
+        found = once(self.curvature)
+        return (found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)
 
 
 class Quadratics(NamedTuple):
