@@ -29,12 +29,13 @@ class Reading(NamedTuple):
     degree: int | None
 
 
-def of_member(readings: curvature.Readings, m: int) -> Reading:
-    return Reading(readings.curvature[m], tuple(map(bool, readings.strict_in[m])), readings.degree)
+def one_by_one(readings: curvature.Readings) -> list[Reading]:
+    each = zip(readings.curvature, readings.strict_in, strict=True)
+    return [Reading(kind, tuple(map(bool, strict)), readings.degree) for kind, strict in each]
 
 
 def read_curvature(psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, Any]) -> Reading:
-    return of_member(read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()}), 0)
+    return one_by_one(read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()}))[0]
 
 
 def _values(constraint: Any) -> dict[str, Any]:
@@ -262,9 +263,7 @@ def test_members_are_read_each_for_itself() -> None:
     for psi in families:
         together = read_curvatures(psi, 2, 2, stacked)
         assert set(together.curvature) >= {CONCAVE, NOT}
-        assert [of_member(together, m) for m in range(12)] == [
-            read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)
-        ]
+        assert one_by_one(together) == [read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)]
 
 
 def test_work_in_python_does_not_grow_with_members(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -623,7 +622,7 @@ def _witnessed(psi: RandomPsi, numbers: Any, rng: np.random.Generator, n: int) -
 
 
 @np.errstate(all="ignore")
-def _check(psi: RandomPsi, reading: curvature.Reading, numbers: Any, rng: np.random.Generator, d: int) -> None:
+def _check(psi: RandomPsi, reading: Reading, numbers: Any, rng: np.random.Generator, d: int) -> None:
     arity = len(reading.strict_in)
     n = arity * d
     jet = psi.jet(_points(rng, n), numbers)
@@ -661,7 +660,7 @@ def test_random_functions(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
             psi = RandomPsi(("sum", psi.tree, within))
         numbers = np.round(rng.uniform(-3, 3, (3, NUMBERS)), 1)
         readings = read_curvatures(psi, arity, d, {"numbers": numbers})
-        for reading, member in zip(readings, numbers, strict=True):
+        for reading, member in zip(one_by_one(readings), numbers, strict=True):
             _check(psi, reading, member, rng, d)
         seen.update(readings.curvature)
     assert sum(seen.values()) == 300
@@ -680,7 +679,7 @@ def test_random_functions_are_refuted(seed: int) -> None:
         psi = RandomPsi(_random_tree(rng, 2, 3))
         numbers = np.round(rng.uniform(-3, 3, (30, NUMBERS)), 1)
         readings = read_curvatures(psi, 1, 2, {"numbers": numbers})
-        for reading, member in zip(readings, numbers, strict=True):
+        for reading, member in zip(one_by_one(readings), numbers, strict=True):
             _check(psi, reading, member, rng, 2)
         seen.update(readings.curvature)
     assert seen[NOT] > seen[UNKNOWN]
