@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 
 import consat as cs
 from consat.certify.optimum import max_min
-from consat.engine.rounds import HOLD
+from consat.engine.rules import HOLD
 from consat.numerics import float64
 from consat.problem.graphs import hops
 from consat.problem.objective import Nu, SmoothingSchedule

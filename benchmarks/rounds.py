@@ -34,7 +34,7 @@ from consat.certify.certificate import bounds
 from consat.certify.optimum import cluster_margins, max_min
 from consat.certify.quadratics import values_and_gradients
 from consat.engine.round import begin, many_rounds
-from consat.engine.rounds import HOLD
+from consat.engine.rules import HOLD
 from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import Groups, float64, quick_compilation

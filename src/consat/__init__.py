@@ -13,11 +13,12 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from consat.errors import ConsatError, InvalidExpression, InvalidInput, InvalidResult, InvalidScenario, InvalidSettings, InvalidTeam
+    from consat.problem.agent import Agent
     from consat.problem.constraints import Constraint, apart, box, constraint, displacement, expr, halfspace, near, outside, within
     from consat.problem.groups import Group, each
     from consat.problem.objective import margins
     from consat.problem.schedule import Schedule, schedule
-    from consat.problem.team import Agent, Team
+    from consat.problem.team import Team
     from consat.results.result import Result
     from consat.robots import Double, Point, Quadrotor, Unicycle, disc, polygon
     from consat.runs.runner import resume, run
@@ -45,7 +46,8 @@ _HOME = {
     "settings": ("Ramp", "Settings", "Smoothing"),
     "problem.groups": ("Group", "each"),
     "problem.schedule": ("Schedule", "schedule"),
-    "problem.team": ("Agent", "Team"),
+    "problem.agent": ("Agent",),
+    "problem.team": ("Team",),
 }  # fmt: skip
 forks.watch()
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

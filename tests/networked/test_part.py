@@ -11,7 +11,8 @@ from consat.errors import InvalidScenario, InvalidSettings, InvalidTeam
 from consat.network.node.part import Part, read_part, split, write_part
 from consat.network.node.problem import OwnSolver, ends
 from consat.numerics import float64
-from consat.problem.team import Agent, Team
+from consat.problem.agent import Agent
+from consat.problem.team import Team
 from consat.scenario import Scenario, load, loads
 from consat.scenario.files import Settings
 from tests.networked.case_c import parts

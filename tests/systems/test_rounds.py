@@ -32,6 +32,16 @@ def positions(result: cs.Result) -> np.ndarray:
     return np.array(list(result.summary["positions"].values()))
 
 
+@float64
+def test_a_protocol_may_ask_for_the_gradient_of_the_objective() -> None:
+    team = cs.load("case-b").team
+    copies = Estimates.of(team, "local")
+    solver = world_of(team, copies, Nu(2.0, 3.0), scale(team), convex=True, faults=Faults(), body=None).everyone
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(copies.count, 2)))
+    total = jax.grad(lambda x: jnp.sum(jnp.exp(solver.local.log_objective(x, solver.nu))))(x)
+    np.testing.assert_allclose(solver.gradient(x), total, rtol=1e-10)
+
+
 @pytest.mark.parametrize(("case", "rounds"), [("case-a", 10), ("case-b", 10), ("case-c", 25), ("case-e", 15)])
 def test_satisfied_for_good_within_a_few_rounds(case: str, rounds: int) -> None:
     for seed in SEEDS:

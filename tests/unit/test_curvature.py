@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from consat.problem.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
-from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvature, read_curvatures
+from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvatures
 from consat.problem.constraints.functions import safe_norm
 from consat.problem.constraints.node import Node
 
@@ -21,6 +21,21 @@ PARAMETERS = {"a": 2.0, "b": -0.5, "c": np.array([1.0, -2.0])}
 
 
 # ------------------------------------------------------------------------------------------------------------ library kinds
+
+
+class Reading(NamedTuple):
+    curvature: Curvature
+    strict_in: tuple[bool, ...]
+    degree: int | None
+
+
+def one_by_one(readings: curvature.Readings) -> list[Reading]:
+    each = zip(readings.curvature, readings.strict_in, strict=True)
+    return [Reading(kind, tuple(map(bool, strict)), readings.degree) for kind, strict in each]
+
+
+def read_curvature(psi: Callable[..., Any], arity: int, dimension: int, parameters: dict[str, Any]) -> Reading:
+    return one_by_one(read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()}))[0]
 
 
 def _values(constraint: Any) -> dict[str, Any]:
@@ -50,7 +65,7 @@ def _values(constraint: Any) -> dict[str, Any]:
 def test_library_kind(make: Callable[[int], Any], kind: Curvature, strict_in: tuple[bool, ...], power: int | None, d: int) -> None:
     made = make(d)
     arity = len(strict_in)
-    assert read_curvature(made.psi, arity, d, _values(made)) == curvature.Reading(kind, strict_in, power)
+    assert read_curvature(made.psi, arity, d, _values(made)) == Reading(kind, strict_in, power)
     assert degree(made.psi, arity, d, _values(made)) == power
 
 
@@ -248,9 +263,7 @@ def test_members_are_read_each_for_itself() -> None:
     for psi in families:
         together = read_curvatures(psi, 2, 2, stacked)
         assert set(together.curvature) >= {CONCAVE, NOT}
-        assert [together[m] for m in range(12)] == [
-            read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)
-        ]
+        assert one_by_one(together) == [read_curvature(psi, 2, 2, {key: value[m] for key, value in stacked.items()}) for m in range(12)]
 
 
 def test_work_in_python_does_not_grow_with_members(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,8 +352,8 @@ def test_degree_holds_for_all_parameters(psi: Callable[..., Any], expected: int 
 
 
 def test_degree_may_be_less_for_given_values() -> None:
-    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 2.0}) == curvature.Reading(STRICTLY, (True,), 2)
-    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 4.0}) == curvature.Reading(CONCAVE, (False,), None)
+    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 2.0}) == Reading(STRICTLY, (True,), 2)
+    assert read_curvature(lambda x, p: 1 - x[0] ** p, 1, 1, {"p": 4.0}) == Reading(CONCAVE, (False,), None)
 
 
 # ---------------------------------------------------------------------------------------------------------- scale and slots
@@ -609,7 +622,7 @@ def _witnessed(psi: RandomPsi, numbers: Any, rng: np.random.Generator, n: int) -
 
 
 @np.errstate(all="ignore")
-def _check(psi: RandomPsi, reading: curvature.Reading, numbers: Any, rng: np.random.Generator, d: int) -> None:
+def _check(psi: RandomPsi, reading: Reading, numbers: Any, rng: np.random.Generator, d: int) -> None:
     arity = len(reading.strict_in)
     n = arity * d
     jet = psi.jet(_points(rng, n), numbers)
@@ -647,7 +660,7 @@ def test_random_functions(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
             psi = RandomPsi(("sum", psi.tree, within))
         numbers = np.round(rng.uniform(-3, 3, (3, NUMBERS)), 1)
         readings = read_curvatures(psi, arity, d, {"numbers": numbers})
-        for reading, member in zip(readings, numbers, strict=True):
+        for reading, member in zip(one_by_one(readings), numbers, strict=True):
             _check(psi, reading, member, rng, d)
         seen.update(readings.curvature)
     assert sum(seen.values()) == 300
@@ -666,7 +679,7 @@ def test_random_functions_are_refuted(seed: int) -> None:
         psi = RandomPsi(_random_tree(rng, 2, 3))
         numbers = np.round(rng.uniform(-3, 3, (30, NUMBERS)), 1)
         readings = read_curvatures(psi, 1, 2, {"numbers": numbers})
-        for reading, member in zip(readings, numbers, strict=True):
+        for reading, member in zip(one_by_one(readings), numbers, strict=True):
             _check(psi, reading, member, rng, 2)
         seen.update(readings.curvature)
     assert seen[NOT] > seen[UNKNOWN]

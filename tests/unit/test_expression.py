@@ -257,6 +257,7 @@ def test_agents_are_read_as_written(text, reads):
         ("max(a1.x, 1)", 0, "log(exp(p) + exp(q))"),
         ("pow(a1.x, 2)", 0, "p ** 2"),
         ("norm(a1) < 2", 0, "write psi so that psi > 0 is what you want: q - p for p < q"),
+        ("norm(a1) >= 2", 0, "p - q for p > q"),
         ("1 < norm(a1) < 2", 0, "psi > 0"),
         ("a1.x == 2", 0, "0.01 - (p - q)**2"),
         ("a1.x = 2", 5, "psi > 0"),

@@ -123,7 +123,8 @@ def random_team(seed: int, count: int = 14) -> cs.Team:
 def test_holders_are_connected_and_contain_the_readers(seed: int) -> None:
     team = random_team(seed)
     pairs = graphs.holders(team, graphs.clusters(team))
-    talk = graphs.communication_graph(team)
+    talk = nx.Graph(team.linked)
+    talk.add_nodes_from(team.ids)
     for j, agent in enumerate(team.ids):
         held = {team.ids[i] for i, k in pairs if k == j}
         readers = {team.ids[i] for i, k in graphs.task_edges(team) if k == j}
@@ -145,7 +146,7 @@ def test_disagreement_is_the_laplacian(layout: str, make) -> None:
     x = np.random.default_rng(0).normal(size=(copies.count, 2))
     expected = np.zeros_like(x)
     row = {(int(i), int(j)): r for r, (i, j) in enumerate(zip(copies.holder, copies.position, strict=True))}
-    for i, j in graphs.communication_graph(team).edges:
+    for i, j in team.linked:
         a, b = team.ids.index(i), team.ids.index(j)
         for held in range(team.count):
             if (a, held) in row and (b, held) in row and copies.cluster[a] == copies.cluster[b]:

@@ -60,10 +60,9 @@ def shape_of(team: Team) -> Shape:
     constant: list[Floats | None] = []
     for family in team.families:
         readings = read_curvatures(family.psi, family.arity, team.dimension, family.lasting, family.size)
-        found, strict_in = once(readings.curvature), once(readings.strict_in)
-        curvature[family.number] = found
-        concave[family.number] = (found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)
-        strict[family.number] = np.any(strict_in & (family.agents == family.owner[:, None]), axis=1)
+        curvature[family.number] = once(readings.curvature)
+        concave[family.number] = readings.concave
+        strict[family.number] = np.any(once(readings.strict_in) & (family.agents == family.owner[:, None]), axis=1)
         quadratic[family.number] = readings.degree is not None
         constant.append(None if readings.degree is None else _hessians(family, team.dimension))
     return Shape(curvature, strict, quadratic, concave, tuple(constant))

@@ -20,7 +20,9 @@ from jax import Array
 
 from consat.engine.chunks import NEVER, Ask, Chosen, Chunk, advance, start
 from consat.engine.round import Now
-from consat.engine.rounds import ENOUGH, HOLD, Rules, Tally, later
+from consat.engine.rounds import later
+from consat.engine.rules import ENOUGH, HOLD, Rules
+from consat.engine.tally import Tally
 from consat.engine.world import World
 from consat.numerics import float64, on_device, quick_compilation
 from consat.protocols import Rounds

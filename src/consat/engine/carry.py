@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.engine.bodies import Driven
+from consat.engine.round import by_axis
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import Shared
@@ -74,13 +75,7 @@ def carried(per: Mapping[str, Any], old: Any, new: Any, before: Names, after: Na
         after: names of the rows of `new`.
     """
     places = {kind: _places(getattr(before, kind), getattr(after, kind)) for kind in ("row", "agent", "constraint", "link", "pair")}
-
-    def choose(per: str | Mapping[str, Any], here: Any, there: Any) -> Any:
-        if isinstance(per, str):
-            return jax.tree.map(lambda a, b: _merged(a, b, places[per]), here, there)
-        return type(there)(**{name: choose(kind, getattr(here, name), getattr(there, name)) for name, kind in per.items()})
-
-    return choose(per, old, new)
+    return by_axis(per, lambda axis, there, here: _merged(here, there, places[axis]), new, old)
 
 
 def _places(before: Sequence[Any], after: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -32,6 +32,8 @@ NEVER = 2**62
 """A number of rounds that is never reached."""
 SCALARS = ("margin", "smooth_margin", "known", "bound", "messages", "floats", "bytes")
 """Fields of `Seen` that every chunk reports for each round."""
+REALS = ("margin", "smooth_margin", "bound")
+"""Those of them that are not integers."""
 
 
 class Kept(NamedTuple):
@@ -207,15 +209,9 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
     d = now.body.shape[1]
     recorded = len(now.body) if chosen.agents is None else len(chosen.agents)
     empty = Chunk(
+        **{name: jnp.zeros(CHUNK, real if name in REALS else whole) for name in SCALARS},
         done=jnp.zeros_like(ask.rounds),
-        margin=jnp.zeros(CHUNK, real),
-        smooth_margin=jnp.zeros(CHUNK, real),
-        known=jnp.zeros(CHUNK, whole),
-        bound=jnp.zeros(CHUNK, real),
         near=ask.near,
-        messages=jnp.zeros(CHUNK, whole),
-        floats=jnp.zeros(CHUNK, whole),
-        bytes=jnp.zeros(CHUNK, whole),
         drift=jnp.zeros((), real),
         violated=jnp.zeros(len(chosen.watched), whole),
         kept=Kept(

@@ -216,7 +216,7 @@ class ManyProcesses:
 
 def together() -> None:
     """Barrier: wait up to `PATIENCE` until every process has arrived, which is longer than an exchange waits."""
-    from jax._src import distributed  # no public function has a longer timeout
+    from jax._src import distributed  # public barriers are exchanges between devices, which wait for a short and fixed time
 
     client: Any = distributed.global_state.client
     client.wait_at_barrier("consat", PATIENCE * 1000)

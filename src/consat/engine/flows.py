@@ -225,7 +225,6 @@ def simulate_flow(
     *,
     until: float | None = None,
     stop: Stop = "satisfied",
-    record: bool | None = None,
     choice: Choice | None = None,
     sink: Sink | None = None,
     checkpoint: Checkpoint | None = None,
@@ -243,14 +242,13 @@ def simulate_flow(
         until: end time, s; `PATIENCE` if None.
         stop: ``satisfied``: end when every margin was positive for `HOLD`, or when the flow has settled and `infeasible` holds.
             ``converged``: end when the flow has settled. ``never``: run until `until`.
-        record: whether to record estimates and integral states; if None, only while they are few.
         choice: what to record; if None, a choice that depends on the size of the team.
         sink: where to record; in memory if None.
         checkpoint: where to save the state, and the checkpoint to resume from; None for neither.
         infeasible: tells whether positions, (N, d), prove that no formation satisfies every constraint.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
-    choice = choice or Choice.of(team, estimates, estimates=record)
+    choice = choice or Choice.of(team, estimates)
     end = PATIENCE if until is None else until
     grid = np.linspace(0.0, end, max(round(end / SAMPLE), 1) + 1)
     size = scale(team)

@@ -58,20 +58,9 @@ class Live:
         """The parameters at time `round_` · `period`. `round_`: () number of finished rounds."""
         time = round_ * self.period
         return tuple(
-            {key: array if (track := tracks.get(key)) is None else _moved(jnp.asarray(array), track, time) for key, array in own.items()}
+            {
+                key: array if (track := tracks.get(key)) is None else jnp.asarray(array).at[track.rows].set(track.at(time, jnp))
+                for key, array in own.items()
+            }
             for own, tracks in zip(self.parameters, self.tracks, strict=True)
         )
-
-
-def _moved(array: Array, track: Track, time: Array) -> Array:
-    """The parameter, (M_f, …), with the rows that move set to their values at `time`, s (piecewise linear)."""
-    times, values = track.times, track.values
-    last = times.shape[1] - 1
-    k = jnp.maximum(jnp.sum((times <= time).astype(jnp.int32), axis=1) - 1, 0)
-    row = jnp.arange(len(k), dtype=k.dtype)
-    after = jnp.minimum(k + 1, last)
-    here, gap = times[row, k], times[row, after] - times[row, k]
-    moving = (gap > 0) & jnp.isfinite(gap)
-    part = jnp.clip(jnp.where(moving, (time - here) / jnp.where(moving, gap, 1.0), 0.0), 0.0, 1.0)
-    low, high = values[row, k], values[row, after]
-    return array.at[track.rows].set(low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low))

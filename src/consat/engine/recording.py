@@ -102,7 +102,7 @@ class Choice:
             InvalidSettings: unknown agent, or `every` below 1.
         """
         if every < 1:
-            raise InvalidSettings(f"every is {every}, but must be a whole number from 1: each how manieth step to record")
+            raise InvalidSettings(f"every is {every}, but must be a whole number from 1: one step in so many is recorded")
         agents = _agents(team, who)
         everyone = len(agents) == team.count
         rows = np.arange(copies.count)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -195,12 +196,21 @@ def _where_awake(per: Mapping[str, Any], world: World, awake: Array, new: Any, o
     if (interior := world.everyone.interior) is not None:
         masks |= {"pair": awake[interior.talker], "constraint": awake[interior.owner]}
 
-    def choose(per: str | Mapping[str, Any], fresh: Any, stale: Any) -> Any:
-        if isinstance(per, str):
-            return jax.tree.map(lambda a, b: jnp.where(masks[per].reshape(-1, *[1] * (a.ndim - 1)), a, b), fresh, stale)
-        return type(fresh)(**{name: choose(kind, getattr(fresh, name), getattr(stale, name)) for name, kind in per.items()})
+    return by_axis(per, lambda axis, a, b: jnp.where(masks[axis].reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
-    return choose(per, new, old)
+
+def by_axis(per: Any, function: Callable[[str, Any, Any], Any], new: Any, old: Any) -> Any:
+    """Combine two states of a protocol, array by array.
+
+    Args:
+        per: leading axis of each field; see `consat.protocols.Rounds.per`.
+        function: function of the name of the leading axis and two arrays.
+        new: state whose type the result has.
+        old: the other state.
+    """
+    if isinstance(per, str):
+        return jax.tree.map(functools.partial(function, per), new, old)
+    return type(new)(**{name: by_axis(kind, function, getattr(new, name), getattr(old, name)) for name, kind in per.items()})
 
 
 def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Array, Array]]:

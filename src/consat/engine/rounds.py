@@ -1,12 +1,11 @@
-"""Protocols in rounds: what is counted and recorded as they go by, and when they end."""
+"""Run of a protocol in rounds: computed by an engine, counted by `tally`, ended by `rules`, recorded by `loop`."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,11 +14,13 @@ from jax import Array
 from consat.engine import Stop
 from consat.engine.bodies import Body
 from consat.engine.checkpoint import Checkpoint, fingerprint
-from consat.engine.chunks import CHUNK, SURE, Chunk, Engine, Kept, OneProcess
+from consat.engine.chunks import Chunk, Engine, Kept, OneProcess
 from consat.engine.live import Live
-from consat.engine.loop import Steps, follow
+from consat.engine.loop import follow
 from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
-from consat.engine.round import BEST, INFEASIBLE, NEAR, SATISFIED, Now
+from consat.engine.round import Now
+from consat.engine.rules import ENOUGH, HOLD, PATIENCE, Rules, longest_hold, stillness, turn_after
+from consat.engine.tally import Tally
 from consat.engine.violations import shares
 from consat.engine.world import World, world_of
 from consat.faults import Faults
@@ -33,125 +34,6 @@ from consat.results.trace import Ending, Trace
 from consat.robots.conditions import conditions
 from consat.robots.drive import Drive, Report
 from consat.robots.simulated import Simulated
-
-ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
-"""What all must know for a run to end, for each stop rule."""
-WORD = 10
-"""Where agents tell each other of their bodies, a satisfied team goes on until all know it, for at most so many rounds a hop more."""
-FAR = 50
-"""Across more hops than these nobody waits for word to get around."""
-HOLD = 10
-"""How many rounds on end every margin must stay positive before a team counts as satisfied."""
-PATIENCE = 2000
-"""How many rounds a team may take when nobody says."""
-PATIENT = 1.5
-"""Whether a team that stands still has no hope is asked again only when the run is so many times as long: the answer takes its time."""
-TURN, TURN_HOP = 10, 2
-"""A team that its links with their loops have not satisfied after so many rounds, and so many for each hop across it, goes over to a
-spanning tree. Measured: random geometric graphs, rings and lattices of 9 to 100 agents are satisfied over their links by then, or torn."""
-SETTLED = 1e-5
-"""A team has settled when over a chunk no position moved by more than this fraction of the team's unit of length, …"""
-SETTLED_ALL_THE_SAME = 1e-7
-"""… or than this, where a certificate should say when it is `enough`."""
-
-
-@dataclass
-class Tally(Steps):
-    """What is counted of rounds.
-
-    Attributes:
-        streak: for how many rounds every margin has been positive.
-        near: for how many rounds all have known what ends the run; see `consat.engine.chunks.Ask`.
-        known: what all know; see `consat.engine.round.knowledge`.
-        infeasible_from: the round from which all have known that the team cannot be satisfied, or None.
-        last_bad: the last round whose margin was ≤ 0, or −1.
-        last_unknown: the last round after which not everybody knew, or −1.
-        messages: sent.
-        floats: sent.
-        bytes: sent.
-        smooth_margin: the last.
-        bound: the last.
-        held: after how many rounds, the start among them, every constraint held.
-        first_held: the first round after which every constraint held, or None.
-        held_since: after how many rounds from that one on they did.
-        worst_since: the least margin from that one on.
-        asked: the round at which it was last asked whether there is hope.
-        turned: the round after which the team went over to a spanning tree, or None.
-        violated: (W,) after how many rounds each watched constraint was violated; None where nobody counts.
-    """
-
-    streak: int = 0
-    near: int = 0
-    last_bad: int = -1
-    last_unknown: int = -1
-    messages: int = 0
-    floats: int = 0
-    bytes: int = 0
-    smooth_margin: float = np.nan
-    bound: float = np.nan
-    asked: int = 0
-    known: int = 0
-    infeasible_from: int | None = None
-    held: int = 0
-    first_held: int | None = None
-    held_since: int = 0
-    worst_since: float = np.inf
-    violated: Any = 0
-    turned: int | None = None
-
-    def add(self, chunk: Chunk) -> np.ndarray:
-        """Count some rounds; gives their numbers."""
-        count = int(chunk.done)
-        numbers = np.arange(self.done + 1, self.done + 1 + count)
-        margin, known = np.asarray(chunk.margin)[:count], np.asarray(chunk.known)[:count]
-        bad, unknown = np.flatnonzero(~(margin > 0)), np.flatnonzero(known & SATISFIED == 0)
-        torn = np.flatnonzero(known & INFEASIBLE)
-        if self.infeasible_from is None and len(torn):
-            self.infeasible_from = int(numbers[torn[0]])
-        self.known, self.near = int(known[-1]), int(chunk.near)
-        self._hold(numbers, margin)
-        self.streak = self.streak + count if not len(bad) else count - 1 - int(bad[-1])
-        self.last_bad = int(numbers[bad[-1]]) if len(bad) else self.last_bad
-        self.last_unknown = int(numbers[unknown[-1]]) if len(unknown) else self.last_unknown
-        self.messages += int(np.sum(np.asarray(chunk.messages)[:count]))
-        self.floats += int(np.sum(np.asarray(chunk.floats)[:count]))
-        self.bytes += int(np.sum(np.asarray(chunk.bytes)[:count]))
-        self.violated = None if chunk.violated is None else np.asarray(self.violated) + np.asarray(chunk.violated)
-        self.done += count
-        self.margin, self.smooth_margin, self.bound = (float(leaf[count - 1]) for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound))
-        self.drift = float(chunk.drift) if count == CHUNK or not np.isfinite(chunk.drift) else np.inf
-        return numbers
-
-    def motion(self, period: float) -> dict[str, Any]:
-        """Of ``run --json`` what is said of a team that moves; period: of a round, s."""
-        since = 0 if self.first_held is None else self.done + 1 - self.first_held
-        return {
-            "duration": self.done * period,
-            "satisfied_share": self.held / (self.done + 1),
-            "satisfied_share_after": self.held_since / since if since else None,
-            "worst_margin_after": self.worst_since if since else None,
-        }
-
-    def _hold(self, numbers: np.ndarray, margin: np.ndarray) -> None:
-        good = margin > 0
-        self.held += int(np.count_nonzero(good))
-        if self.first_held is None and good.any():
-            self.first_held = int(numbers[np.argmax(good)])
-        if self.first_held is not None:
-            since = margin[numbers >= self.first_held]
-            self.held_since += int(np.count_nonzero(since > 0))
-            self.worst_since = min(self.worst_since, float(since.min()))
-
-
-def stillness(length: float, enough: Callable[[np.ndarray], bool] | None) -> float:
-    """A chunk in which no position moved farther is one in which the team stood still; length: the team's unit."""
-    return (SETTLED if enough is None else SETTLED_ALL_THE_SAME) * length
-
-
-def longest_hold(protocol: Rounds, world: World) -> int:
-    """How many rounds on end a team may be satisfied before its run ends, though not all know it."""
-    hops = world.everyone.hops
-    return HOLD + (WORD * (1 + hops) if protocol.speaks == "pair" and hops <= FAR else 0)
 
 
 @float64
@@ -169,7 +51,6 @@ def simulate_rounds(
     stop: Stop = "satisfied",
     faults: Faults | None = None,
     body: Body | None = None,
-    record: bool | None = None,
     choice: Choice | None = None,
     sink: Sink | None = None,
     checkpoint: Checkpoint | None = None,
@@ -182,30 +63,30 @@ def simulate_rounds(
     """Run a protocol in rounds.
 
     Args:
-        team: whose clusters are connected.
-        protocol: what they do.
+        team: team with connected clusters.
+        protocol: the protocol.
         copies: the layout of estimates.
         nu: the smoothing.
-        size: the team's natural size.
-        first: (C, d) first estimates, with x_i^(i)(0) = x_i(0).
+        size: the natural scale of the team.
+        first: (C, d) initial estimates; those of own positions are the initial positions.
         convex: whether every ψ is known to be concave.
-        rounds: how many; `PATIENCE` if None.
-        least: rounds before which nothing ends the run, since constraints still move.
-        stop: when to end earlier: every margin positive for `HOLD` rounds (or `hopeless` and settled); settled, or `enough`; or never.
-        faults: loss and sleep; none if None.
-        body: how fast positions follow estimates; at once if None.
-        record: whether to keep all estimates; if None, while they are few.
-        choice: what to record; if None, what the size of the team suggests.
-        sink: where to; in memory if None.
-        checkpoint: where to keep the state, and what to take up; nowhere and nothing if None.
-        hopeless: says of (N, d) positions whether they prove that no formation satisfies every constraint.
-        enough: says of (N, d) positions whether no formation is better by more than a tolerance.
-        then: the layout to which the team goes over where that of `copies` has not satisfied it in time, see `TURN`; None if it has none.
-        events: whether agents send only what is news, see `consat.protocols.sending`.
+        rounds: largest number of rounds; `PATIENCE` if None.
+        least: number of rounds before which nothing ends the run, because constraints still move.
+        stop: condition that ends the run earlier. ``satisfied``: every margin is positive for `HOLD` rounds, or the team is settled and
+            `hopeless`. ``converged``: the team is settled, or its margin is `enough`.
+        faults: loss and sleep; None for none.
+        body: motion of the bodies; None if they are at the estimates.
+        choice: what is recorded; if None, the default for the size of the team.
+        sink: where to record; if None, in memory.
+        checkpoint: where to save the state, and the checkpoint to resume from; None for neither.
+        hopeless: see `Rules`.
+        enough: see `Rules`.
+        then: layout to which a team switches that `copies` has not satisfied in time, see `turn_after`; None without one.
+        events: whether agents send only what is new; see `consat.protocols.sending`.
         progress: called with the fraction done (of the longest possible run) and the margin.
     """
     faults = faults or Faults()
-    choice = choice or Choice.of(team, copies, estimates=record)
+    choice = choice or Choice.of(team, copies)
     most, turn = HOLD, None
     engine: Engine
     if jax.process_count() > 1:
@@ -239,12 +120,12 @@ def simulate_rounds(
 
 
 class Turn(NamedTuple):
-    """How a run goes over to another layout of copies.
+    """Switch to another layout of copies.
 
     Attributes:
-        engine: who carries it out from then on, from first estimates.
-        before: the layout until then.
-        after: the layout from then on.
+        engine: returns the engine after the switch, from initial estimates, (C, d).
+        before: the layout before the switch.
+        after: the layout after the switch.
     """
 
     engine: Callable[[np.ndarray], OneProcess]
@@ -252,18 +133,13 @@ class Turn(NamedTuple):
     after: Estimates
 
 
-def turn_after(world: World) -> int:
-    """The round after which a team that is not satisfied over its links goes over to a spanning tree."""
-    return TURN + TURN_HOP * world.everyone.hops
-
-
 def later(seed: int) -> int:
-    """The seed of what goes wrong from then on."""
+    """Seed of the faults after a switch to another layout."""
     return seed ^ 1
 
 
 def _over(choice: Choice, before: Estimates, after: Estimates) -> Choice:
-    """What is recorded from then on: the same copies, and of one that its holder no longer has the position that it was of."""
+    """What is recorded after a switch: the same copies. For a copy that its holder no longer has, the owner's own copy of the position."""
     if choice.copies is None:
         return choice
     position = before.position[choice.copies]
@@ -271,74 +147,8 @@ def _over(choice: Choice, before: Estimates, after: Estimates) -> Choice:
     return dataclasses.replace(choice, copies=np.where(found, rows, after.own[position]))
 
 
-@dataclass(frozen=True)
-class Rules:
-    """When a run ends; see `simulate_rounds`.
-
-    Attributes:
-        end: rounds at most.
-        least: rounds at least.
-        stop: when to end earlier.
-        most: how many satisfied rounds on end are the end, whether all know it or not.
-        still: a chunk in which no position moved farther is one in which the team stood still, length.
-        earliest: the round before which to stand still means nothing.
-        hopeless: see `simulate_rounds`.
-        enough: see `simulate_rounds`.
-        turn: the round after which a team that is not satisfied goes over to another layout; None if it has none.
-    """
-
-    end: int
-    stop: Stop
-    still: float
-    most: int = HOLD
-    least: int = 0
-    earliest: int = 0
-    hopeless: Callable[[np.ndarray], bool] = lambda _: False
-    enough: Callable[[np.ndarray], bool] | None = None
-    turn: int | None = None
-
-    def turns(self, tally: Tally) -> bool:
-        """Whether the team goes over to another layout now: the one that it has is not known to get anywhere."""
-        return self.turn is not None and tally.turned is None and tally.done >= self.turn and tally.streak == 0
-
-    def chunk(self, tally: Tally) -> int:
-        """How many rounds to go before the next look."""
-        looks = [at for at in (self.turn, self.least, self.end) if at is not None and at > tally.done]
-        return min(CHUNK, min(looks, default=tally.done) - tally.done)
-
-    def ending(self, tally: Tally, positions: Callable[[], np.ndarray]) -> Ending | None:
-        """Why the run should end now, or None."""
-        if np.isnan(tally.drift) or (tally.drift == np.inf and not np.isfinite(positions()).all()):
-            return "diverged"
-        if self.stop == "never" or tally.done < self.least:
-            return None
-        if self.stop == "satisfied" and tally.streak >= HOLD and (tally.known & SATISFIED or tally.streak >= self.most):
-            return "satisfied"
-        if tally.near >= SURE:
-            return "settled"
-        if self.stop == "converged" and self.enough is not None and self.enough(positions()):
-            return "settled"
-        if tally.done - (tally.turned or 0) < self.earliest or tally.drift > self.still:
-            return None
-        if self.stop == "converged":
-            return "settled"
-        if tally.done < PATIENT * tally.asked:
-            return None
-        tally.asked = tally.done
-        return "settled" if self.hopeless(positions()) else None
-
-
 class _Course:
-    """Rounds, for `consat.engine.loop`.
-
-    Args:
-        team: who runs.
-        engine: who carries them out.
-        rules: when they end.
-        choice: what is recorded.
-        body: see `simulate_rounds`.
-        turn: see there; None if there is none.
-    """
+    """`consat.engine.loop.Course` in rounds; arguments as in `simulate_rounds`."""
 
     def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None, turn: Turn | None) -> None:
         self._turn = turn
@@ -365,8 +175,8 @@ class _Course:
         return state, rows, ending
 
     def turn(self, first: np.ndarray) -> None:
-        """Go over to the other layout, from first estimates, (C, d)."""
-        assert self._turn is not None, "of a team that has one"
+        """Switch to the other layout. `first`: (C, d) initial estimates."""
+        assert self._turn is not None
         self._engine = self._turn.engine(first)
 
     def agree(self, stop: bool) -> bool:
@@ -402,7 +212,7 @@ class _Course:
             "messages": tally.messages,
             "floats_sent": tally.floats,
             "bytes": tally.bytes,
-            **_known(tally),
+            **tally.knowledge,
             "turned": tally.turned,
             "period": self._period,
             "heading": rows.heading,
@@ -411,14 +221,9 @@ class _Course:
         }
 
 
-def known_of(tally: Tally) -> Literal["satisfied", "infeasible"] | None:
-    """What all agents know."""
-    return "satisfied" if tally.known & SATISFIED else "infeasible" if tally.known & INFEASIBLE else None
-
-
 def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
-    """Of ``run --json`` what is said of robots: distances, m, contacts, who is stuck, and which conditions for that nobody
-    touches did not hold."""
+    """Fields of the summary for robots: smallest distances, m, contacts, stuck robots, and conditions of the collision guarantee that did
+    not hold."""
     if world.drive is None or now.robots is None:
         none = {"smallest_distance": None, "clearance": None, "simulator": None}
         return none | {"contacts": 0, "collisions": 0, "stuck": [], "unproven": []}
@@ -439,14 +244,5 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
 
 @functools.cache
 def _ended() -> Callable[..., tuple[Report, Array]]:
-    """`Drive.ended` as one program: op by op it is sixty."""
+    """`Drive.ended` compiled as one program."""
     return jax.jit(Drive.ended, static_argnums=0, compiler_options=quick_compilation())
-
-
-def _known(tally: Tally) -> Mapping[str, Any]:
-    """What all agents know at the end, and since when. They judge by estimates: what does not hold at their positions is not known."""
-    if tally.known & SATISFIED and tally.last_bad < tally.done:
-        return {"known": "satisfied", "known_from": max(tally.last_unknown, tally.last_bad) + 1}
-    if tally.known & INFEASIBLE:
-        return {"known": "infeasible", "known_from": tally.infeasible_from}
-    return {"known": None, "known_from": None}

@@ -1,10 +1,10 @@
-"""Checks ψ of each constraint by tracing it once, before anything runs, and groups constraints that share a function into families."""
+"""Constraints of single agents: checks them, ψ included, before anything runs, and groups those that share a function into families."""
 
 from __future__ import annotations
 
 import functools
 import types
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,13 +13,11 @@ import numpy as np
 
 from consat.errors import Fault, InvalidExpression
 from consat.numerics import float64
-from consat.problem.constraints.record import Constraint
+from consat.problem.constraints.record import OWNER, Constraint, Number, flatten
 from consat.problem.family import FamilyPart
-from consat.problem.parameters import Path
+from consat.problem.index import SUGGESTIONS, Index, who_is
+from consat.problem.parameters import Path, checked, still
 from consat.problem.schedule import Schedule, Track
-
-SUGGESTIONS = 20
-"""With this many faults, errors stop suggesting similar ids and locating columns within expressions: in a large team that takes long."""
 
 
 @dataclass
@@ -149,3 +147,78 @@ def _tracks(entries: Sequence[Entry]) -> dict[str, Track]:
 def _sources(entries: Sequence[Entry]) -> tuple[str, ...] | None:
     texts = tuple(entry.constraint.source for entry in entries if entry.constraint.source is not None)
     return texts if len(texts) == len(entries) else None
+
+
+def entries_of(index: Index, dimension: int, faults: list[Fault]) -> Iterator[Entry]:
+    """Check the constraints of the single agents, and yield those without faults.
+
+    Args:
+        index: the agents.
+        dimension: d.
+        faults: list to which faults are added.
+    """
+    for number, i, agent in index.singles:
+        taken: dict[str, int] = {}
+        who = who_is(number, agent.id)
+        for k, item in enumerate(agent.constraints):
+            path: Path = ("agents", number, "constraints", k)
+            for constraint in flatten(item):
+                if not isinstance(constraint, Constraint):
+                    faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", who))
+                    continue
+                named = len(faults)
+                name = _name(constraint, taken, path, agent.id, who, faults)
+                where = f"{who}, constraint {name!r}"
+                reads = _reads(constraint, agent.id, index, path, where, faults)
+                entry = Entry(constraint, i, reads, name, path, where)
+                for key, parameter in constraint.parameters.items():
+                    value = checked(parameter, dimension, (*path, key), key, where, faults)
+                    if value is not None:
+                        entry.take(key, value)
+                weight = still(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
+                entry.weight = 1.0 if weight is None else float(weight)
+                if len(faults) == named and reads:
+                    yield entry
+
+
+def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, who: str, faults: list[Fault]) -> str:
+    """The name that the user gave, or one derived from the kind and the other agents, with a number if it would repeat."""
+    if constraint.name is not None:
+        if not isinstance(constraint.name, str) or not constraint.name.strip() or not constraint.name.isprintable():
+            faults.append(Fault((*path, "name"), f"name is {constraint.name!r}, but must be a printable text", who))
+        elif constraint.name in taken:
+            message = f"name {constraint.name!r} is taken by another constraint of {who}; choose another"
+            faults.append(Fault((*path, "name"), message, who))
+        else:
+            taken[constraint.name] = 1
+        return str(constraint.name)
+    others = [str(agent) for agent in constraint.reads if not isinstance(agent, str) or agent not in (OWNER, owner)]
+    base = f"{constraint.kind}({', '.join(others)})" if others else constraint.kind
+    name = base
+    while name in taken:
+        taken[base] += 1
+        name = f"{base} #{taken[base]}"
+    taken[name] = 1
+    return name
+
+
+def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
+    key: Path = ("psi",) if constraint.source is not None else ("agent",)
+    reads: list[str] = []
+    for agent in constraint.reads:
+        if isinstance(agent, str) and (agent == OWNER or agent in index):
+            reads.append(owner if agent == OWNER else agent)
+        else:
+            faults.append(Fault((*path, *key), index.unknown(agent, faults), where))
+    if not isinstance(owner, str) or owner not in index:
+        return ()  # the owner's id has a fault, which `Index` reports
+    if owner not in reads:
+        faults.append(Fault((*path, *key), f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", where))
+    if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
+        itself = "its own owner" if repeated == owner else "the same agent twice"
+        faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
+    return tuple(index[agent] for agent in reads)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names)) or "nothing"

@@ -1,13 +1,12 @@
 """Task graph, clusters and communication graph (paper, section IV-A), and which agent holds an estimate of which position.
 
-All functions work on arrays of edges. `task_graph` and `communication_graph` return networkx graphs over ids.
+All functions work on arrays of edges.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -16,9 +15,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from consat.errors import Fault, InvalidTeam
 from consat.problem.family import distinct
 from consat.problem.team import Team
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 
 def task_edges(team: Team) -> np.ndarray:
@@ -278,26 +274,6 @@ def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> s
                 added.add(agent)
             agent = parent[agent]
     return added
-
-
-def task_graph(team: Team) -> nx.DiGraph:
-    """The task graph as a networkx graph over ids, with self-edges."""
-    import networkx as nx
-
-    graph = nx.DiGraph()
-    graph.add_nodes_from(team.ids)
-    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in task_edges(team))
-    return graph
-
-
-def communication_graph(team: Team) -> nx.Graph:
-    """The communication graph as a networkx graph over ids."""
-    import networkx as nx
-
-    graph = nx.Graph()
-    graph.add_nodes_from(team.ids)
-    graph.add_edges_from((team.ids[i], team.ids[j]) for i, j in team.links)
-    return graph
 
 
 def _keys(pairs: np.ndarray, count: int) -> np.ndarray:

@@ -73,12 +73,16 @@ class Track(NamedTuple):
         times, values = (np.stack(column) for column in zip(*padded, strict=True))
         return cls(np.array(list(moving), dtype=np.int32), times, values)
 
-    def at(self, time: float) -> np.ndarray:
-        """(R, …) the values at `time`, s."""
-        k, part = _place(self.times, time)
-        row = np.arange(len(k))
-        low, high = self.values[row, k], self.values[row, np.minimum(k + 1, self.times.shape[1] - 1)]
-        return np.asarray(low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low))
+    def at(self, time: Any, xp: Any = np) -> Any:
+        """(R, …) the values at `time`, s. `xp`: the library of the arrays, `numpy` or `jax.numpy`."""
+        times, values = self.times, self.values
+        k = xp.maximum((times <= time).sum(axis=1).astype(np.int32) - 1, 0)  # the last time that is ≤ `time`
+        row, after = xp.arange(len(k), dtype=k.dtype), xp.minimum(k + 1, times.shape[1] - 1)
+        here, gap = times[row, k], times[row, after] - times[row, k]
+        moving = (gap > 0) & xp.isfinite(gap)
+        part = xp.clip(xp.where(moving, (time - here) / xp.where(moving, gap, 1.0), 0.0), 0.0, 1.0)
+        low, high = values[row, k], values[row, after]
+        return low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low)
 
     def joined(self, more: Sequence[tuple[Track, int]]) -> Track:
         """This track joined with others.
@@ -133,14 +137,3 @@ def _padded(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarra
         return times, values
     width = [(0, 0)] * axis + [(0, missing)]
     return np.pad(times, width, constant_values=np.inf), np.pad(values, width + [(0, 0)] * (values.ndim - axis - 1), mode="edge")
-
-
-def _place(times: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) index of the last of the (R, K) times that is ≤ `time`, and (R,) elapsed fraction of the interval to the next one, in [0, 1]."""
-    k = np.maximum((times <= time).sum(axis=1) - 1, 0)
-    row = np.arange(len(times))
-    here, there = times[row, k], times[row, np.minimum(k + 1, times.shape[1] - 1)]
-    gap = there - here
-    with np.errstate(invalid="ignore", divide="ignore"):
-        part = np.where((gap > 0) & np.isfinite(gap), (time - here) / np.where(gap > 0, gap, 1.0), 0.0)
-    return k, np.clip(part, 0.0, 1.0)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from consat.errors import Fault, InvalidTeam, shown
+from consat.problem.agent import Agent
 from consat.problem.changes import named, place_of
 from consat.problem.constraints.record import flatten
 from consat.problem.graphs import require_connected
-from consat.problem.team import Agent, Team
+from consat.problem.team import Team
 
 
 def with_agent(team: Team, agent: Agent, links: Iterable[str] | None = None) -> Team:

@@ -1,4 +1,9 @@
-"""Registry of the protocols. Each protocol has a module that begins with its equations; add a new one to `FLOWS` or `ROUNDS`."""
+"""Protocols: functions of one agent's state, its own constraints and its neighbours' messages; interfaces in `base`.
+
+Input: initial estimates, a `Solver` or a `Local` of the agent, received messages. Output: the agent's new state, and its messages. Each
+protocol has a module that begins with its equations; add a new one to `FLOWS` or `ROUNDS`. Must not import `consat.engine` or
+`consat.network`, which call it.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping

@@ -160,6 +160,10 @@ class Solver(Protocol):
         """
         ...
 
+    def gradient(self, x: Array) -> Array:
+        """(rows, d) ∇f_i at the estimates `x`, (rows, d). Where ln f_i exceeds 600, f_i counts as e^600, so that it stays finite."""
+        ...
+
     def margin(self, x: Array) -> Array:
         """(N,) ᾱ_i at the estimates `x`, (rows, d); +∞ without constraints."""
         ...
@@ -211,17 +215,17 @@ class Rounds(Protocol):
         ...
 
     def news(self, said: Any, held: Any, solver: Solver) -> Array:
-        """Whether what would be said differs from what a neighbour holds by more than it can do without; one row of what `speaks` says.
+        """Whether a message differs from the last one sent by more than a tolerance, so that it must be sent; leading axis as in `speaks`.
 
         Args:
-            said: what would be.
-            held: what was sent last.
-            solver: own.
+            said: the present messages.
+            held: the messages sent last, which the neighbours hold.
+            solver: local computations of the agent.
         """
         ...
 
     def brief(self, message: Any) -> Any:
-        """The message as it is sent where few bytes count: numbers that may be are rounded to 32 bits."""
+        """The message with floats rounded to 32 bits where the protocol tolerates it, to send fewer bytes."""
         ...
 
     def hear(self, state: Any, message: Any, arrived: Array, solver: Solver) -> Any:

@@ -133,7 +133,7 @@ class InteriorPoint:
         return differs | (proves & (True if self.cap is None else said.level < PROVES))
 
     def brief(self, message: Mail) -> Mail:
-        """Proofs stay as they are, since any rounding of theirs would have to be outward."""
+        """Proofs are not rounded: rounding them would have to be outward."""
         matrix, vector, barrier, level, margin = map(
             single, (message.matrix, message.vector, message.barrier, message.level, message.margin)
         )  # fmt: skip
@@ -161,12 +161,12 @@ class InteriorPoint:
 
 
 def _own(solver: Solver) -> Interior:
-    assert solver.interior is not None, "of a protocol that speaks to pairs"
+    assert solver.interior is not None, "only for protocols that send one message per pair"
     return solver.interior
 
 
 PROVES = 0.1
-"""In units of ψ: a team whose level is above is satisfied, or about to be, and asks for no proof that it cannot be."""
+"""Level, in units of ψ, above which no proof of infeasibility is sent: the team is satisfied, or about to be."""
 NEARLY, EXACTLY = 0.05, 1e-3
 """A margin is near the best if its gap to the bound is at most `NEARLY` times |bound|, or at most `EXACTLY` in units of ψ."""
 

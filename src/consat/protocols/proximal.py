@@ -67,7 +67,7 @@ class Proximal:
         return jnp.zeros(len(x)) + 1.0 / (self.step * solver.length**2)
 
     def news(self, said: Array, held: Array, solver: Solver) -> Array:
-        """Whatever differs is: both ends must integrate the same differences."""
+        """Every difference counts: both ends must integrate the same disagreement."""
         return jnp.any(said != held, axis=1)
 
     def brief(self, message: Array) -> Array:

@@ -168,17 +168,20 @@ class LocalSolver:
         return replace(self, local=self.local.with_parameters(values), interior=interior, plan=plan)
 
     def recall(self, x: Array, kappa: Array) -> prox.Memory:
-        assert self.plan is not None, "of a protocol that takes proximal steps"
+        assert self.plan is not None, "only for protocols that take proximal steps"
         return prox.recall(self.plan, self.nu, x, kappa)
 
     def prox(self, v: Array, kappa: Array, x: Array, memory: prox.Memory) -> tuple[Array, prox.Memory, Array]:
-        assert self.plan is not None, "of a protocol that takes proximal steps"
+        assert self.plan is not None, "only for protocols that take proximal steps"
         return prox.step(self.plan, self.nu, v, kappa, x, memory, offset=0.0, precision=self.precision)
 
     def nearby(self, x: Array) -> Array:
         idle = (self.links.degree == 0) & jnp.isinf(self.to_rows(self.margin(x)))
         near = jnp.where(idle[:, None], x, self.region.nearby(x, self.convex))
         return Footing(self.local, self.nu, self.length, self.region, self.holder, self.own).find(near)
+
+    def gradient(self, x: Array) -> Array:
+        return self.local.gradient(x, self.nu)
 
     def margin(self, x: Array) -> Array:
         return self.local.agent_margins(x)

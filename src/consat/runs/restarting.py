@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from consat.engine.batch import Case, Lane, Then, simulate_batch
-from consat.engine.rounds import PATIENCE, Rules, longest_hold, stillness, turn_after
+from consat.engine.rules import PATIENCE, Rules, longest_hold, stillness, turn_after
 from consat.engine.world import World, world_of
 from consat.faults import Faults
 from consat.numerics import float64, number

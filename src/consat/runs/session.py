@@ -23,17 +23,19 @@ from consat.engine.chunks import CHUNK, Chunk, OneProcess
 from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Now
-from consat.engine.rounds import Tally, driven, known_of
+from consat.engine.rounds import driven
+from consat.engine.tally import Tally, known_of
 from consat.engine.world import World, world_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam
 from consat.numerics import float64, on_device
 from consat.problem import structure
+from consat.problem.agent import Agent
 from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, place_of
 from consat.problem.constraints.library import ADJUSTABLE, farthest
 from consat.problem.graphs import require_connected
 from consat.problem.objective import Objective
 from consat.problem.parameters import vector
-from consat.problem.team import Agent, Team
+from consat.problem.team import Team
 from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
 from consat.protocols.estimates import Layout

@@ -10,10 +10,12 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from consat.problem.agent import Agent
 from consat.problem.constraints import KINDS
 from consat.problem.groups import ACROSS, MOST, PLACE, SHAPES, Group
+from consat.problem.links import TOPOLOGIES
 from consat.problem.schedule import KEYS as SCHEDULE_KEYS
-from consat.problem.team import LONGEST_UNIT, TOPOLOGIES, Agent
+from consat.problem.team import LONGEST_UNIT
 from consat.scenario.mappings import TEXT
 from consat.scenario.schema import AGENT_KEYS, GROUP_KEYS, KEYS, MEMBER_KEYS, VERSION
 from consat.settings import Settings

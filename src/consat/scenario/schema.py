@@ -12,10 +12,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from consat.errors import AT_KEY, Fault, InvalidInput, InvalidTeam, counted, shown
+from consat.problem.agent import Agent
 from consat.problem.constraints import KINDS
 from consat.problem.groups import MOST, Each, Group
+from consat.problem.links import Links
 from consat.problem.parameters import LARGEST, is_number
-from consat.problem.team import Agent, Links, Team
+from consat.problem.team import Team
 from consat.scenario.document import Document, Path
 from consat.scenario.mappings import constraint
 from consat.scenario.words import complaints, unknown_key

@@ -18,8 +18,9 @@ from consat.errors import Fault, InvalidTeam
 from consat.problem.constraints import KINDS, OWNER, Constraint, box
 from consat.problem.family import Family
 from consat.problem.groups import Each, Group
+from consat.problem.links import TOPOLOGIES, topology
 from consat.problem.schedule import Schedule
-from consat.problem.team import TOPOLOGIES, Team, topology
+from consat.problem.team import Team
 from consat.scenario.document import resolve
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings

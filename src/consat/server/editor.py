@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from consat.errors import ConsatError, Fault, InvalidInput, InvalidTeam, shown
-from consat.problem.team import Agent, Team
+from consat.problem.agent import Agent
+from consat.problem.team import Team
 from consat.runs.preparation import robots_of
 from consat.runs.session import Session
 from consat.scenario import Scenario, dump

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from consat.errors import Fault, InvalidTeam, closest, shown
+from consat.problem.agent import Agent
 from consat.problem.constraints.record import OWNER, Constraint, flatten
-from consat.problem.team import Agent, Team
+from consat.problem.team import Team
 
 
 class Silent(NamedTuple):

@@ -265,6 +265,9 @@ class _Outline:
     def prox(self, v: Array, kappa: Array, x: Array, memory: Memory) -> tuple[Array, Memory, Array]:
         return v, memory, kappa
 
+    def gradient(self, x: Array) -> Array:
+        return x
+
     def margin(self, x: Array) -> Array:
         return jnp.zeros(1)
 

@@ -21,9 +21,10 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from consat.errors import AT_KEY, Fault, InvalidSettings, closest, counted, shown
 from consat.numerics import float64
+from consat.problem.agent import Agent
 from consat.problem.family import Family
 from consat.problem.objective import Nu
-from consat.problem.team import Agent, Team
+from consat.problem.team import Team
 from consat.scenario import Scenario, dump
 from consat.scenario.document import LARGEST, Document, decode, read
 from consat.scenario.robots import Robots

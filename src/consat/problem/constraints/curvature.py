@@ -66,39 +66,24 @@ _STRICTLY, _CONCAVE, _UNKNOWN, _NOT = range(4)
 
 
 @dataclass(frozen=True)
-class Reading:
-    """The proven properties of one ψ.
-
-    Attributes:
-        curvature: curvature in all positions jointly.
-        strict_in: for each position, whether ψ is strictly concave in that position alone, with the others fixed.
-        degree: upper bound (0, 1 or 2) on the degree of ψ as a polynomial in the positions; None if no such bound is proven.
-    """
-
-    curvature: Curvature
-    strict_in: tuple[bool, ...]
-    degree: int | None
-
-
-@dataclass(frozen=True)
 class Readings:
-    """The proven properties of a family of M functions; `readings[m]` is one `Reading`.
+    """The proven properties of a family of M functions.
 
     Attributes:
-        curvature: (M,) of `Curvature`.
-        strict_in: (M, arity) bool; as in `Reading`.
-        degree: as in `Reading`, for all members together.
+        curvature: (M,) of `Curvature`, in all positions jointly.
+        strict_in: (M, arity) bool: whether ψ is strictly concave in one position alone, with the others fixed.
+        degree: upper bound (0, 1 or 2) on the degree of every ψ as a polynomial in the positions; None if no such bound is proven.
     """
 
     curvature: Array
     strict_in: NDArray[np.bool_]
     degree: int | None
 
-    def __len__(self) -> int:
-        return len(self.curvature)
-
-    def __getitem__(self, member: int) -> Reading:
-        return Reading(self.curvature[member], tuple(map(bool, self.strict_in[member])), self.degree)
+    @property
+    def concave(self) -> NDArray[np.bool_]:
+        """(M,) bool; (1,) if all members are known to be alike."""
+        found = once(self.curvature)
+        return (found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)
 
 
 class Quadratics(NamedTuple):
@@ -117,27 +102,15 @@ class Quadratics(NamedTuple):
     hessian: Array
 
 
-def read_curvature(psi: Psi, arity: int, dimension: int, parameters: Mapping[str, ArrayLike]) -> Reading:
-    """The curvature of one ψ.
+def read_curvatures(
+    psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[str, ArrayLike], members: int | None = None
+) -> Readings:
+    """The curvature of every member of a family.
 
     Args:
         psi: ``psi(*positions, **parameters) -> scalar``, traceable by JAX.
         arity: number of positions ψ takes.
         dimension: d, the length of each position.
-        parameters: keyword arguments of ψ.
-    """
-    return read_curvatures(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in parameters.items()})[0]
-
-
-def read_curvatures(
-    psi: Psi, arity: int, dimension: int, stacked_parameters: Mapping[str, ArrayLike], members: int | None = None
-) -> Readings:
-    """The curvature of every member of a family; see `read_curvature`.
-
-    Args:
-        psi: as in `read_curvature`.
-        arity: as in `read_curvature`.
-        dimension: as in `read_curvature`.
         stacked_parameters: keyword arguments of ψ, members along axis 0. NaN stands for any value: the result holds for all of them.
         members: M; required only if ψ has no parameters.
     """
@@ -158,9 +131,9 @@ def degree(psi: Psi, arity: int, dimension: int, example_parameters: Mapping[str
     """An upper bound (0, 1 or 2) on the polynomial degree of ψ in the positions, for all parameter values; None if none is proven.
 
     Args:
-        psi: as in `read_curvature`.
-        arity: as in `read_curvature`.
-        dimension: as in `read_curvature`.
+        psi: ``psi(*positions, **parameters) -> scalar``, traceable by JAX.
+        arity: number of positions ψ takes.
+        dimension: d, the length of each position.
         example_parameters: keyword arguments with the right shapes and types; their values do not matter.
     """
     family = _Family.of(psi, arity, dimension, {key: np.asarray(value)[None] for key, value in example_parameters.items()})

@@ -104,7 +104,8 @@ _INSTEAD: Final[Mapping[str | type, str]] = {
     "min": f"min has no gradient where its arguments meet; {_EACH}",
     "max": "max has no gradient where its arguments meet; write 1 - max(p, q) as two constraints, max(p, q) as log(exp(p) + exp(q))",
     "pow": "a power is written p ** 2",
-    ast.Compare: "comparisons have no gradient; write psi so that psi > 0 is what you want: q - p for p < q, 0.01 - (p - q)**2 for p == q",
+    ast.Compare: "comparisons have no gradient; write psi so that psi > 0 is what you want: q - p for p < q, p - q for p > q, "
+    "0.01 - (p - q)**2 for p == q",
     ast.And: f"'and' is not part of an expression; {_EACH}",
     ast.Or: "'or' is not part of an expression; log(exp(p) + exp(q)) > 0 is nearly 'p > 0 or q > 0'",
     ast.IfExp: f"'if' is not differentiable; {_EACH}",

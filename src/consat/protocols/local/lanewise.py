@@ -1,4 +1,4 @@
-"""Operations on arrays whose last axis is the agent (the lane), size A. Both local steps use them."""
+"""What both local steps use: operations on arrays whose last axis is the agent (the lane), size A, and constant curvatures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+
+from consat.numerics import once
+from consat.problem.constraints.curvature import hessians
+from consat.problem.family import Family
 
 
 def along(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,3 +54,12 @@ def eliminated(matrix: Array, right: Array) -> tuple[Array, Array]:
     start = jnp.concatenate([matrix, right], axis=1), jnp.ones(matrix.shape[-1], bool)
     whole, positive = jax.lax.fori_loop(0, size, eliminate, start)
     return whole[:, size:], positive
+
+
+def bend_of(family: Family, dimension: int) -> np.ndarray | None:
+    """(n, n) −∇²ψ for weight 1, n = arity·d; None unless it is constant and the same for all constraints of the family."""
+    try:
+        constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
+    except ValueError:  # not a polynomial of degree ≤ 2
+        return None
+    return -constant[0] if len(constant) == 1 and np.isfinite(constant).all() else None

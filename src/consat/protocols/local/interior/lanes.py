@@ -40,13 +40,8 @@ class Units(NamedTuple):
     @classmethod
     def of(cls, size: Scale) -> Units:
         """From the natural scale of a team."""
-        return cls(
-            on_device(size.center),
-            on_device(size.length),
-            on_device(size.typical),
-            on_device(size.reach / size.length),
-            on_device(size.extent / size.length),
-        )
+        values: Any = (size.center, size.length, size.typical, size.reach / size.length, size.extent / size.length)
+        return cls(*map(on_device, values))
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,13 @@ from jax import Array
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from consat.numerics import laid_out, on_device, once
-from consat.problem.constraints.curvature import hessians
+from consat.numerics import laid_out, on_device
+from consat.problem.constraints.curvature import read_curvatures
 from consat.problem.family import Family, distinct
 from consat.problem.graphs import middles
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
+from consat.protocols.local.lanewise import bend_of
 
 Route = Literal["tree", "links"]
 """How copies are exchanged: ``tree``, all along one spanning tree, or ``links``, over all links, each position along a tree of its own."""
@@ -385,17 +386,11 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
 
 def form_of(family: Family, dimension: int) -> Form:
     """Static properties of the constraints of a family. `dimension`: d."""
-    from consat.problem.constraints.curvature import Curvature, read_curvatures
-
     readings = read_curvatures(family.psi, family.arity, dimension, family.lasting, family.size)
-    found, moves = once(readings.curvature), bool(family.tracks)
-    concave = bool(((found == Curvature.CONCAVE) | (found == Curvature.STRICTLY_CONCAVE)).all())
-    try:
-        constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
-    except ValueError:
-        return Form(family.psi, None, concave, quadratic=False, moves=moves)
-    if len(constant) != 1 or not np.isfinite(constant).all():
-        return Form(family.psi, None, concave, quadratic=readings.degree is not None, moves=moves)
-    values, vectors = np.linalg.eigh(-constant[0])
+    concave, quadratic, moves = bool(readings.concave.all()), readings.degree is not None, bool(family.tracks)
+    bend = bend_of(family, dimension)
+    if bend is None:
+        return Form(family.psi, None, concave, quadratic, moves)
+    values, vectors = np.linalg.eigh(bend)
     rows = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 1e-12 * max(1e-300, np.abs(values).max(initial=0.0))].T
-    return Form(family.psi, tuple(tuple(map(float, row)) for row in rows), concave, quadratic=readings.degree is not None, moves=moves)
+    return Form(family.psi, tuple(tuple(map(float, row)) for row in rows), concave, quadratic, moves)

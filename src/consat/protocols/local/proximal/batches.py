@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jax import Array
 
-from consat.numerics import laid_out, on_device, once
-from consat.problem.constraints.curvature import hessians
+from consat.numerics import laid_out, on_device
 from consat.problem.constraints.domain import Extended, extended
 from consat.problem.family import Family, distinct
 from consat.problem.team import Team
+from consat.protocols.local.lanewise import bend_of
 
 SMALL_TEAM = 2000
 """Largest team whose agents are batched by size and padded, which compiles once. In larger teams common patterns get a batch of their own,
@@ -269,14 +269,8 @@ def _own_first(slot: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def _bend(family: Family, dimension: int) -> Matrix | None:
-    """−∇²ψ for weight 1, if it is constant and the same for all members; else None."""
-    try:
-        constant = once(hessians(family.psi, family.arity, dimension, family.lasting, family.size))
-    except ValueError:
-        return None
-    if len(constant) != 1 or not np.isfinite(constant).all():
-        return None
-    return tuple(tuple(map(float, line)) for line in -constant[0])
+    found = bend_of(family, dimension)
+    return None if found is None else tuple(tuple(map(float, line)) for line in found)
 
 
 @dataclass(frozen=True)

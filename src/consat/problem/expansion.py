@@ -1,0 +1,308 @@
+"""Constraints of a group as arrays: resolves which members own them, and which agents they read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consat.errors import Fault, shown
+from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
+from consat.problem.family import Derived, FamilyPart, Repeated
+from consat.problem.groups import ACROSS, OTHER, PLACE, SELF, Each, Group, Ints, Layout, label, layout
+from consat.problem.parameters import Path, checked, checked_rows
+from consat.problem.schedule import Schedule, Track
+
+
+@dataclass
+class Expansion:
+    """Turns the constraints of a group into arrays.
+
+    Attributes:
+        group: a group without faults; see `faults_of`.
+        first: index of its first member in the team.
+        ids: ids of the team.
+        find: function from an id to its index in the team, or None.
+        dimension: d.
+        path: place of the group in the input, for faults.
+        faults: list to which faults are added.
+        layout: places of the members.
+    """
+
+    group: Group
+    first: int
+    ids: Sequence[str]
+    find: Any
+    dimension: int
+    path: Path
+    faults: list[Fault]
+    layout: Layout = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.layout = layout(self.group, self.dimension)
+
+    def parts(self) -> list[tuple[FamilyPart, Constraint, Path, str]]:
+        """For each constraint of the group: the part with one row per owner, the constraint, and its place in the input, for faults."""
+        made: list[tuple[FamilyPart, Constraint, Path, str]] = []
+        named: dict[str, Path] = {}
+        for path, entry in self.entries():
+            constraint = entry.constraint
+            where = f"{label(self.group)}, constraint {constraint.name or constraint.kind!r}"
+            if constraint.name is not None and not self.good_name(constraint.name, named, path, where):
+                continue
+            part = self.part(entry, path, where)
+            if part is not None:
+                made.append((part, constraint, path, where))
+        return self.told_apart(made)
+
+    def entries(self) -> Iterator[tuple[Path, Each]]:
+        """(path, constraint with its owners) for each constraint of the group; nested lists are flattened."""
+        for k, item in enumerate(self.group.constraints):
+            path = (*self.path, "constraints", k)
+            outer = item if isinstance(item, Each) else Each(item)
+            for constraint in flatten(outer.constraint):
+                if isinstance(constraint, Constraint):
+                    yield path, replace(outer, constraint=constraint)
+                elif isinstance(constraint, Each):
+                    yield path, constraint
+                else:
+                    message = f"{constraint!r} is no constraint; use consat.within and its like"
+                    self.faults.append(Fault(path, message, label(self.group)))
+
+    def good_name(self, name: Any, named: dict[str, Path], path: Path, where: str) -> bool:
+        """Whether a given name is valid and new in the group. Adds it to `named`, or a fault."""
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            self.faults.append(Fault((*path, "name"), f"name is {shown(name)}, but must be a printable text", where))
+        elif name in named:
+            message = f"name {name!r} is taken by another constraint of {label(self.group)}; choose another"
+            self.faults.append(Fault((*path, "name"), message, where))
+        else:
+            named[name] = path
+            return True
+        return False
+
+    def part(self, entry: Each, path: Path, where: str) -> FamilyPart | None:
+        """The part for one constraint of the group, with one row per owner and agent read, without names; None if it has faults."""
+        constraint, known = entry.constraint, len(self.faults)
+        rows = self.members(entry.of, path, where)
+        slots = self.slots(constraint, entry.agent, path, where)
+        if len(self.faults) > known:
+            return None
+        row, other = self.related(slots.relation, rows, path, where)
+        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in slots.reads]
+        values, tracks = {}, {}
+        for key, parameter in constraint.parameters.items():
+            value = self.values(parameter, row, other, (*path, key), key, where)
+            if isinstance(value, Schedule):
+                many = len(row)
+                times, places = (np.broadcast_to(each, (many, *each.shape)) for each in (value.times, value.values))
+                tracks[key] = Track(np.arange(many, dtype=np.int32), times, places)
+                value = np.broadcast_to(value.at(0.0), (many, *value.values.shape[1:]))
+            values[key] = value
+        weight = self.values(Number(constraint.weight, positive=True), row, other, (*path, "weight"), "weight", where)
+        if isinstance(weight, Schedule):
+            self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
+        if len(self.faults) > known or isinstance(weight, Schedule):
+            return None
+        return FamilyPart(
+            kind=constraint.kind,
+            psi=constraint.psi,
+            agents=np.stack(columns, axis=1).astype(np.int32),
+            owner=(row + self.first).astype(np.int32),
+            parameters=values,
+            weight=weight,
+            names=(),
+            sources=None if constraint.source is None else Repeated(constraint.source, len(row)),
+            tracks=tracks if len(row) else {},
+        )
+
+    def members(self, of: Any, path: Path, where: str) -> Ints:
+        """The indices, in the group, of the members that own a constraint; see `each` for `of`."""
+        count = self.group.count
+        if of is None:
+            return np.arange(count)
+        if isinstance(of, np.ndarray) and of.ndim == 1 and of.dtype.kind in "iu":
+            if not len(of) or (of.min() >= 0 and of.max() < count):
+                return of.astype(np.int64)
+            self.faults.append(Fault((*path, "of"), f"of holds places beyond 0 to {count - 1}", where))
+            return np.arange(0)
+        if of in ("first", "last"):
+            return np.array([0 if of == "first" else count - 1])
+        if isinstance(of, Mapping) and list(of) == ["every"] and type(of["every"]) is int and of["every"] >= 1:
+            return np.flatnonzero((self.layout.steps % of["every"] == 0).all(axis=1))
+        chosen = of if isinstance(of, list | tuple) else [of]
+        places = [self.find(name) for name in chosen if isinstance(name, str)]
+        inside = [place - self.first for place in places if place is not None and 0 <= place - self.first < count]
+        if len(inside) != len(chosen) or not inside:
+            example = f"first, last, {{every: 10}}, or ids of the group such as [{self.group.name}1]"
+            self.faults.append(Fault((*path, "of"), f"of is {shown(of)}, but must be one of {example}", where))
+        return np.unique(np.array(inside, dtype=np.int64))
+
+    class Slots(NamedTuple):
+        """The positions that ψ takes.
+
+        Attributes:
+            reads: `OWNER`, `OTHER`, or the index of an agent in the team, for each position.
+            relation: how `OTHER` is found; None if ψ does not read it.
+        """
+
+        reads: list[Any]
+        relation: Any
+
+    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> Slots:
+        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`."""
+        reads: list[Any] = []
+        relation: Any = None
+        written = constraint.source is not None
+        for read in constraint.reads:
+            if isinstance(read, str) and (read == OWNER or (written and read == SELF)):
+                reads.append(OWNER)
+            elif not isinstance(read, str) or (written and read == OTHER):
+                relation = agent if isinstance(read, str) else read
+                reads.append(OTHER)
+            elif (place := self.find(read)) is not None:
+                reads.append(place)
+            else:
+                relative = f"; in a group, {SELF} is the member and {OTHER} the one that `agent` tells of" if written else ""
+                key = "psi" if written else "agent"
+                self.faults.append(Fault((*path, key), f"there is no agent {shown(read)}{relative}", where))
+        if OWNER not in reads and not self.faults:
+            key = "psi" if written else "agent"
+            self.faults.append(Fault((*path, key), f"it must read the position of its owner, {SELF}, but does not", where))
+        if OTHER in reads and relation is None:
+            message = f"agent is missing: it tells who `{OTHER}` is, such as -1 for the one ahead"
+            self.faults.append(Fault((*path, "agent"), message, where))
+        elif agent is not None and OTHER not in reads:
+            self.faults.append(Fault((*path, "agent"), f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", where))
+        fixed = [read for read in reads if isinstance(read, int)]
+        if len(set(fixed)) < len(fixed):
+            self.faults.append(Fault((*path, "agent"), "it names the same agent twice; name another agent", where))
+        return self.Slots(reads, relation)
+
+    def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+        """Resolve a relation for the owners `rows`.
+
+        Returns:
+            the indices, in the group, of the owners for which the relation finds an agent, and the indices, in the team, of these agents.
+        """
+        if relation is None:
+            return rows, np.zeros(len(rows), dtype=np.int64)
+        if isinstance(relation, np.ndarray):
+            inside = (relation >= 0) & (relation < self.group.count) if relation.dtype.kind in "iu" else np.zeros(1, dtype=bool)
+            if relation.shape == rows.shape and inside.all():
+                return self.apart_from_itself(rows, relation.astype(np.int64), path, where)
+            message = f"agent must be an array of {len(rows)} places from 0 to {self.group.count - 1}, one for each of these constraints"
+        elif isinstance(relation, Mapping):
+            k = relation.get("nearest")
+            if list(relation) == ["nearest"] and type(k) is int and 1 <= k < self.group.count:
+                return self.nearest(k, rows)
+            message = f"agent is {shown(relation)}, but must be {{nearest: k}} with k from 1 to {self.group.count - 1}"
+        else:
+            steps = list(relation) if isinstance(relation, list | tuple) else [relation]
+            axes = len(self.layout.sides)
+            if all(type(step) is int for step in steps) and any(steps) and len(steps) in (1, axes):
+                return self.shifted(steps, rows)
+            grid = f", or a list of {axes} of them, steps along the axes of the grid" if axes > 1 else ""
+            message = (
+                f"agent is {shown(relation)}, but must be an id, a whole number other than 0, such as -1 for the one ahead{grid}, "
+                "or {nearest: k}"
+            )
+        self.faults.append(Fault((*path, "agent"), message, where))
+        return rows[:0], rows[:0]
+
+    def apart_from_itself(self, rows: Ints, others: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+        """Resolve an array of indices. Adds a fault if it names an owner itself."""
+        if (rows == others).any():
+            self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
+        return rows, others + self.first
+
+    def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
+        """Resolve an offset along the group (one step) or along the axes of its grid (d steps)."""
+        count = self.group.count
+        if len(steps) == 1:
+            other = rows + steps[0]
+            if self.layout.ring:
+                other %= count
+            inside = (other >= 0) & (other < count) & (other != rows)
+            return rows[inside], other[inside] + self.first
+        target = self.layout.steps[rows] + np.array(steps)
+        inside = ((target >= 0) & (target < self.layout.sides)).all(axis=1)
+        rows = rows[inside]
+        other = np.ravel_multi_index(tuple(target[inside].T), self.layout.sides)
+        exists = other < count  # the last row of a grid may be short
+        return rows[exists], other[exists] + self.first
+
+    def nearest(self, k: int, rows: Ints) -> tuple[Ints, Ints]:
+        """Resolve ``{"nearest": k}``: k rows for each owner."""
+        from scipy.spatial import cKDTree
+
+        places = self.layout.places
+        found = cKDTree(places, balanced_tree=False, compact_nodes=False).query(places[rows], k + 1, workers=-1)[1]
+        itself = found == rows[:, None]
+        itself[~itself.any(axis=1), -1] = True  # where places coincide, the owner may be missing among those found
+        return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
+
+    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
+        """(M, …) values of one parameter, or one schedule for all. Placeholder values if a fault was added."""
+        value, places = parameter.value, self.layout.places
+        if isinstance(parameter, Vector) and isinstance(value, str) and value == ACROSS and key == "center":
+            return -places[row]
+        if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
+            return places[row] - places[other - self.first] if key == "vector" else places[row]
+        if isinstance(value, np.ndarray) and value.ndim == (2 if isinstance(parameter, Vector) else 1) and not _fixed(parameter):
+            rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
+            return np.zeros(len(row)) if rows is None else rows
+        one = checked(parameter, self.dimension, path, key, where, self.faults)
+        if isinstance(one, Schedule):
+            return one
+        return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
+
+    def told_apart(self, made: list[tuple[FamilyPart, Constraint, Path, str]]) -> list[tuple[FamilyPart, Constraint, Path, str]]:
+        """The same list with names. A name that one owner would have twice gets a number."""
+        stems: dict[str, list[int]] = {}
+        others = []
+        for p, (part, constraint, _, _) in enumerate(made):
+            reads = part.agents if constraint.name is None else part.agents[:, :0]
+            others.append(_others(reads, part.owner))
+            stems.setdefault(constraint.name or f"{constraint.kind}({others[p].shape[1]})", []).append(p)
+        named = list(made)
+        for parts in stems.values():
+            owner = np.concatenate([made[p][0].owner for p in parts])
+            keys = [owner, *np.concatenate([others[p] for p in parts]).T]
+            rank, start = _ranks(keys), 0
+            for p in parts:
+                part, constraint, path, where = made[p]
+                stop = start + len(part.owner)
+                ids = self.ids if constraint.name is None else None
+                mine = rank[start:stop] if rank is not None else None
+                names = Derived(constraint.name or constraint.kind, ids, others[p], mine)
+                named[p] = replace(part, names=names), constraint, path, where
+                start = stop
+        return named
+
+
+def _fixed(parameter: Any) -> bool:
+    return not isinstance(parameter, Number | Vector)
+
+
+def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """(M, k − 1) the agents read besides the owner, which is one of the k; (M, 0) if k = 0."""
+    if not agents.shape[1]:
+        return agents
+    if (agents[:, 0] == owner).all():
+        return agents[:, 1:]
+    return agents[agents != owner[:, None]].reshape(len(agents), agents.shape[1] - 1)
+
+
+def _ranks(keys: list[np.ndarray]) -> np.ndarray | None:
+    """(M,) number of earlier rows with equal keys; None if all rows differ."""
+    order = np.lexsort(keys[::-1]) if len(keys) > 1 else np.argsort(keys[0], kind="stable")
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    if new.all():
+        return None
+    rank = np.empty(len(order), dtype=np.int32)
+    rank[order] = np.arange(len(order)) - np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))
+    return rank
