@@ -285,8 +285,8 @@ def test_who_ends_without_being_told_to_is_started_again_and_knows_what_it_knew(
             while not until():
                 assert time.monotonic() < end, supervisor.endings(0.0)
                 observer.take(fleet.poll(0.05))
-                supervisor.mend()
-                supervisor.act()
+                supervisor.restart_ended()
+                supervisor.advance()
 
         def known() -> bool:
             return supervisor.done == 1 and observer.all_known()[0] == "satisfied" and observer.records["a3"].ended is not None

@@ -1,4 +1,4 @@
-"""Launches a whole team as processes on this machine, watches it until it has converged, and returns a `Result` as any other run."""
+"""Runs a whole team as processes on this machine until it has converged, and returns a `Result` as any other run."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         observer.take(fleet.stop())
     seconds = {"compile": up - began, "run": time.monotonic() - up}
     schedule = Schedule.of(automatic(size) if settings.smoothing == "auto" else settings.smoothing)
-    team = supervisor.stage.there()[0]
+    team = supervisor.stage.present_team()[0]
     trace = observer.trace(
         copies_of(supervisor.tree or team, settings.protocol), schedule.final, ending, seconds, supervisor.stages, supervisor.tick
     )
@@ -163,11 +163,11 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     summary |= told(team, settings.protocol) | {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
     if supervisor.tree is not None:
         summary |= {"route": "tree", "why": "the links form loops and had not satisfied the team in time; it went over to a spanning tree"}
-    summary["warnings"] += [*map(_told, ended), *([] if scenario.robots is None else [BODILESS])]
+    summary["warnings"] += [*map(_warning, ended), *([] if scenario.robots is None else [BODILESS])]
     return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
 
-def _told(ended: Mapping[str, Any]) -> str:
+def _warning(ended: Mapping[str, Any]) -> str:
     """Warning about an agent whose process ended without being told to. `ended`: see `Supervisor.endings`."""
     again = "it was started again" if ended["restarted"] else "it was not started again"
     return f"the process of agent {ended['agent']!r} ended ({ended['how']}) at {ended['time']:.1f} s; {again}"
@@ -205,7 +205,7 @@ def _rules(parts: Mapping[str, Part], plan: Plan, length: float) -> _Rules:
 
 
 class Supervisor:
-    """Controls the agents of a launch: starts them, restarts them after a crash, sends them the time and the commands.
+    """Controls the agents of a launch: starts them, restarts those that end unasked, and sends them the time and the commands.
 
     Args:
         fleet: the processes of the agents.
@@ -218,8 +218,8 @@ class Supervisor:
     Attributes:
         stages: states of the team so far, in order of time.
         epoch: Unix time of t = 0, s; None until all agents are ready.
-        tree: the present agents with the links of a spanning tree, along which they exchange copies; None while they do so along all links.
         ready: the same time on the monotonic clock of this machine, s.
+        tree: the team on the links of a spanning tree, along which it exchanges copies since `turn`; None while it does so along all links.
     """
 
     def __init__(
@@ -233,7 +233,7 @@ class Supervisor:
         self._standby = set(parts) - script.begin.present
         self._generation = 0
         self.tree: Team | None = None
-        self._changed = -np.inf  # stamp of the last change of the team by a command or a restart
+        self._changed = -np.inf  # stamp of the last command or restart
         self._turned: float | None = None  # stamp at which `turn` has decided on a tree; None before
         self._endings: list[dict[str, Any]] = []
         observer.present = script.begin.present
@@ -278,7 +278,7 @@ class Supervisor:
         return np.inf if self.epoch is None else self._stamp(self.epoch) + last
 
     def start(self, agent: str) -> None:
-        """Start or restart an agent, with its body where it was last record. In lockstep it resumes from its state on disk."""
+        """Start or restart an agent, with its body at its last reported position. In lockstep it resumes from its state on disk."""
         ids, seed = list(self.observer.team.ids), self._scenario.settings.start.seed
         own = ["--seed", str(seed * len(ids) + ids.index(agent))]
         if self.observer.records[agent].places:
@@ -291,7 +291,7 @@ class Supervisor:
             own += ["--standby"]
         self.fleet.start(agent, *own)
 
-    def mend(self) -> None:
+    def restart_ended(self) -> None:
         """Restart the agents whose process has ended, except those that were told to end.
 
         Raises:
@@ -334,7 +334,7 @@ class Supervisor:
         how = signal.Signals(-code).name if code < 0 else why
         self._endings.append({"agent": agent, "time": time.monotonic(), "how": how, "restarted": restarted})
 
-    def act(self) -> None:
+    def advance(self) -> None:
         """Send the agents the time once all are ready; after that, carry out the commands that are due."""
         if self.epoch is None:
             if not all(record.born is not None for record in self.observer.records.values()):
@@ -363,7 +363,7 @@ class Supervisor:
         if command.command == "join" and not self._is_ready(agent):
             return False
         self.tree = self._turned = None
-        self._split_again(command.after.there()[0])
+        self._split_again(command.after.present_team()[0])
         if command.command in ("leave", "join"):
             self._standby -= {agent}
             self.fleet.tell(agent, {"command": command.command})
@@ -387,7 +387,7 @@ class Supervisor:
         if self._turned is not None or not self._overdue():
             return
         self._turned = time.monotonic()
-        team, protocol = self.stage.there()[0], self._scenario.settings.protocol
+        team, protocol = self.stage.present_team()[0], self._scenario.settings.protocol
         then = way_of(team, str(protocol.kind), protocol.estimates).then
         if then is not None:
             self.tree = team.with_links(then.links)
@@ -397,7 +397,7 @@ class Supervisor:
     def still_from(self) -> float:
         """The stamp from which standing still counts as convergence: not before `turn` has decided, and the agents follow the tree."""
         if self.tree is not None and self._turned is not None:
-            born = [record.born for record in self.observer.there]
+            born = [record.born for record in self.observer.present_records]
             return max((np.inf if each is None or each < self._turned else each for each in born), default=-np.inf)
         return np.inf if self._turned is None and self._may_turn and self._unsatisfied() else -np.inf
 
@@ -406,14 +406,14 @@ class Supervisor:
         return self.plan.mode == "interior-point" and not self.stage.team.moves
 
     def _unsatisfied(self) -> bool:
-        """Whether an agent has reported a margin that is not positive; at the estimates where bodies are slow and long on their way."""
+        """Whether an agent has reported a margin that is not positive. Bodies with a limited speed lag, so there estimates are judged."""
         kind = "margin" if self.plan.speed is None else "estimate_margin"
-        margins = [record.report[kind] for record in self.observer.there if record.report is not None]
+        margins = [record.report[kind] for record in self.observer.present_records if record.report is not None]
         return any(margin is not None and margin <= 0 for margin in margins)
 
     def _overdue(self) -> bool:
         """Whether the team has taken enough turns since its last change, and is still not satisfied."""
-        plan, there = self.plan, self.observer.there
+        plan, there = self.plan, self.observer.present_records
         if not (self._may_turn and self._unsatisfied() and all(record.stamps for record in there)):
             return False
         first = max(self._changed, min(record.stamps[0] for record in there))
@@ -452,14 +452,14 @@ def _watch(supervisor: Supervisor, rules: _Rules, title: str, quiet: bool) -> En
             while end is None or time.monotonic() < end:
                 observer.take(supervisor.fleet.poll(0.05))
                 draw(observer, {agent: supervisor.fleet.running(agent) for agent in agents}, time.monotonic() - began)
-                supervisor.mend()
-                supervisor.act()
+                supervisor.restart_ended()
+                supervisor.advance()
                 supervisor.turn()
                 if not np.isfinite(observer.positions()).all():
                     return "diverged"
-                if plan.rounds is not None and all(record.finished or record.ended for record in observer.there):
+                if plan.rounds is not None and all(record.finished or record.ended for record in observer.present_records):
                     return "out of time"
-                if not all(record.stamps for record in observer.there):
+                if not all(record.stamps for record in observer.present_records):
                     continue
                 if end is None:
                     end = time.monotonic() + (plan.until or 0.0)
@@ -474,7 +474,7 @@ def _ending(supervisor: Supervisor, rules: _Rules) -> Ending | None:
     observer, stop, earliest = supervisor.observer, supervisor.plan.ending, supervisor.earliest
     if stop == "never":
         return None
-    latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in observer.there)
+    latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in observer.present_records)
     known, since = observer.all_known()[0], observer.concluded()
     since = None if since is None else max(since, earliest)
     if (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:
