@@ -20,8 +20,9 @@ import consat as cs
 from consat.network.deploy import output
 from consat.network.deploy.commands import read_commands
 from consat.network.deploy.fleet import Event, Fleet, free_ports
-from consat.network.deploy.launch import Plan, Supervisor
+from consat.network.deploy.launch import Plan
 from consat.network.deploy.observer import Observer
+from consat.network.deploy.supervisor import Supervisor
 from consat.network.node.part import Part, split
 from consat.scenario import load
 from tests.networked.case_c import GOAL
