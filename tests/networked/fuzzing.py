@@ -34,7 +34,7 @@ EXPECTED: dict[str, dict[Kind, list[Any]]] = {
     "bob": {Kind.HELLO: [], Kind.STATE: [(2, 2), Numbers((3,), INF)], Kind.GOODBYE: [(1,)], Kind.RESEND: [(1, 2), LAYOUT.numbers()]},
     "carol": {Kind.STATE: [Numbers((2, 6), (9.0, 9.0, INF, 100.0, 100.0, 1e6))]},  # as of estimates, a margin, a body, and its age
     "the 3rd/*": {Kind.STATE: [Numbers((4, 1), 100.0)], Kind.RESEND: [(0,), (0, 3)], Kind.SAME: [(1,)]},
-    "dave": {Kind.STATE: [(1, 2), *LAYOUT.brief()], Kind.SAME: [Numbers((3,), 100.0, single=True)]},
+    "dave": {Kind.STATE: [(1, 2), *LAYOUT.half_numbers()], Kind.SAME: [Numbers((3,), 100.0, single=True)]},
 }
 WINDOW = {Reason.DUPLICATE, Reason.STALE, Reason.JUMP}
 INTERESTING = (0, 1, 2, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)

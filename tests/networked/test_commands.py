@@ -118,7 +118,7 @@ def test_an_observer_judges_each_moment_by_the_constraints_of_that_moment() -> N
         track = [[100.0 + 0.1 * k, 0.0, 0.0] for k in range(31)]
         observer.take([{"event": "report", "id": agent, "t": 0.0, "track": track, "sent": {}, "peers": {}}])
     observer.present = stages[-1].present
-    trace = observer.trace(copies_of(stages[-1].there()[0], ProtocolSettings()), Nu(5.0, 5.0), "out of time", {}, stages, 1.0)
+    trace = observer.trace(copies_of(stages[-1].present_team()[0], ProtocolSettings()), Nu(5.0, 5.0), "out of time", {}, stages, 1.0)
     early, late = trace.steps < 1.5 - 1e-6, trace.steps > 1.5 + 1e-6
     np.testing.assert_allclose(trace.agent_margin[early, 0], 1 - trace.steps[early] ** 2, atol=1e-9)
     np.testing.assert_allclose(trace.agent_margin[late, 0], 1.0)

@@ -381,7 +381,7 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
 def test_mail_keeps_its_places_when_somebody_has_gone() -> None:
     """And is 0 where it was about them."""
     whole = split(loads(RELAYED), run="x")["b"]
-    less = core_of(whole, NodeSettings("interior-point")).among({"a"})
+    less = core_of(whole, NodeSettings("interior-point")).without({"a"})
     assert [neighbour.id for neighbour in less.part.neighbours] == ["c"]
     state = less.begin(less.part.first)
     _, said, _ = less.turn(state, *less.empty(), moment(less))

@@ -20,8 +20,9 @@ import consat as cs
 from consat.network.deploy import output
 from consat.network.deploy.commands import read_commands
 from consat.network.deploy.fleet import Event, Fleet, free_ports
-from consat.network.deploy.launch import Plan, Supervisor
+from consat.network.deploy.launch import Plan
 from consat.network.deploy.observer import Observer
+from consat.network.deploy.supervisor import Supervisor
 from consat.network.node.part import Part, split
 from consat.scenario import load
 from tests.networked.case_c import GOAL
@@ -285,8 +286,8 @@ def test_who_ends_without_being_told_to_is_started_again_and_knows_what_it_knew(
             while not until():
                 assert time.monotonic() < end, supervisor.endings(0.0)
                 observer.take(fleet.poll(0.05))
-                supervisor.mend()
-                supervisor.act()
+                supervisor.restart_ended()
+                supervisor.advance()
 
         def known() -> bool:
             return supervisor.done == 1 and observer.all_known()[0] == "satisfied" and observer.records["a3"].ended is not None

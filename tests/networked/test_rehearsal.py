@@ -280,7 +280,7 @@ class Naive(LinkCore):
         outbox[:, -1] = 0.0  # says nothing of its integral
         return StepResult(state, Rows(outbox, said.pair), x)
 
-    def among(self, gone: Any) -> "Naive":
+    def without(self, gone: Any) -> "Naive":
         return Naive(self.whole, self.k1, self.k2, gone)
 
 
@@ -307,7 +307,7 @@ def test_kept_rows_and_ends_are_found_by_name() -> None:
     """What an agent remembers of an end belongs to it, wherever it stands after the membership has changed."""
     with jax.enable_x64(True):
         whole = LinkCore(parts()["a2"], 1.0, 1.0)
-        less = whole.among({"a1"})
+        less = whole.without({"a1"})
         state = whole.begin(whole.part.first)._replace(force=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
         assert whole.ends == [("a1", "a1"), ("a3", "a3")]
         assert less.carry(whole, state, less.part.first).force.tolist() == [[3.0, 3.0]]

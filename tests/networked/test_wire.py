@@ -354,19 +354,6 @@ def test_without_quiet_what_passes_only_ever_grows(numbers: list[tuple[int, int]
     assert door.counts.total() == len(numbers) - len(accepted)
 
 
-def test_who_comes_and_goes() -> None:
-    door = checker({})
-    assert passes(door, 1, 1) == [False]
-    door.expect("a1", {Kind.STATE: [(2,)]})
-    assert passes(door, 1, 2) == [True]
-    door.expect("a1", {Kind.STATE: [(3,)]})
-    assert passes(door, 1, 3) == [False], "of another shape now"
-    assert door.accept(encode(message(sequence=2, arrays=(np.zeros(3),)))) is None, "and its numbers go on"
-    assert door.accept(encode(message(sequence=4, arrays=(np.zeros(3),)))) is not None
-    door.forget("a1")
-    assert door.accept(encode(message(sequence=5, arrays=(np.zeros(3),)))) is None
-
-
 def test_expectations_that_no_message_can_meet_are_an_error() -> None:
     for shapes in ([(1, 2, 3)], [()], [(2**23, 2**23)], [(LONGEST,)], [(1,)] * 33):
         with pytest.raises(NetworkError, match="arrays"):

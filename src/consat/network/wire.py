@@ -60,7 +60,6 @@ _CHECKSUM: Final = struct.Struct("<I")
 _SINGLE: Final = 4
 """Added to the dimensions of an array of 32 bits."""
 _TYPES: Final = {False: "<f8", True: "<f4"}
-_LARGEST_COUNT: Final = 2**64 - 1
 
 
 class Kind(IntEnum):
@@ -207,25 +206,12 @@ class Checker:
         self._problem = problem
         self._quiet = quiet
         self._clock = clock
-        self._neighbours: dict[bytes, _Neighbour] = {}
-        self._longest = 0
-        for name, expected in neighbours.items():
-            self.expect(name, expected)
-
-    def expect(self, neighbour: str, expected: Expected) -> None:
-        """Listen to a new neighbour, or expect other arrays from one; what is known of its numbers stays."""
-        name = _name(neighbour)
-        layouts = {int(kind): _Layout.of(arrays) for kind, arrays in expected.items()}
-        if (known := self._neighbours.get(name)) is None:
-            self._neighbours[name] = _Neighbour(neighbour, layouts, _Window())
-        else:
-            self._neighbours[name] = known._replace(layouts=layouts)
-        self._measure()
-
-    def forget(self, neighbour: str) -> None:
-        """Listen to it no more."""
-        self._neighbours.pop(_name(neighbour), None)
-        self._measure()
+        self._neighbours = {
+            _name(name): _Neighbour(name, {int(kind): _Layout.of(arrays) for kind, arrays in expected.items()}, _Window())
+            for name, expected in neighbours.items()
+        }
+        each = (len(name) + layout.bytes for name, about in self._neighbours.items() for layout in about.layouts.values())
+        self._longest = _HEADER.size + len(self._me) + max(each, default=0) + _CHECKSUM.size
 
     def accept(self, payload: bytes) -> Message | None:
         """The message, or None if it is to be dropped."""
@@ -234,10 +220,6 @@ class Checker:
             self.counts[found] += 1
             return None
         return found
-
-    def _measure(self) -> None:
-        each = (len(name) + layout.bytes for name, about in self._neighbours.items() for layout in about.layouts.values())
-        self._longest = _HEADER.size + len(self._me) + max(each, default=0) + _CHECKSUM.size
 
     def _broken(self, payload: bytes) -> Reason | None:
         """What tells, without a look inside, that this is no message that anybody could have sent here."""

@@ -1,12 +1,12 @@
-"""Which messages are worth sending (``--sends events``): the same rule in the engine and on a network.
+"""The rule by which agents send only news (``--sends events``); the engine and the network share it.
 
-An agent remembers what each neighbour holds from it. It keeps silent towards a neighbour while what it would say differs from that by less
-than a tolerance, which is relative to what is said, or to the barrier of the interior point, and so shrinks as the team converges. What
-it sends it remembers as the neighbour reads it, rounded, so that what rounding took off is sent with the next message.
+An agent remembers what each neighbour holds from it, as rounded for the message. It sends nothing to a neighbour while the new message
+differs from that by less than a tolerance. The tolerance is relative to the message, or to the barrier of the interior point, so that it
+shrinks as the team converges. Rounding errors do not accumulate: they are part of the next difference.
 
-Where nothing gets lost, silence says "as before, and ages go on": the receiver goes on with what it holds, and counts ages up, as the
-sender does. Where messages get lost, silence is nothing but a lost message: the receiver keeps what it has, ages are told until they say
-all there is to know, and an agent repeats itself now and then, in case its last message was lost.
+If no message is lost, silence means "as before, one round later": sender and receiver both keep the old message and increase its ages. If
+messages can be lost, silence has no meaning: the receiver keeps what it has, ages are sent until they are complete, and an agent repeats
+its last message from time to time in case it was lost.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from consat.protocols.agreement import NEVER, Word
 from consat.protocols.base import Rounds, Solver
 
 Sends = Literal["all", "events"]
-"""When agents send: in every round, or when they have something to say."""
+"""When agents send: in every round, or only news."""
 SENDS: Final = get_args(Sends)
 PLACE: Final = 1e-4
-"""A body that moved by less, in the team's unit of length, is where it was; …"""
+"""Smallest motion of a body that is news, in the team's unit of length."""
 LAG: Final = 10.0
-"""… and one that moves is told of when it is farther from where it was said to be than it moves in so many rounds."""
+"""A moving body is news once it is farther from its last sent position than it moves in `LAG` rounds."""
 BEAT: Final = 16
-"""Where messages get lost, an agent repeats itself 2, 4, 8, … rounds after its last news, and then whenever so many have passed."""
+"""If messages can be lost, an agent repeats its last message 2, 4, 8, … rounds after the last news, and then every `BEAT` rounds."""
 HEADER: Final = 72
-"""Bytes of a message beside its numbers, their shapes and the names in it; see `consat.network.wire`."""
+"""Size of a message without numbers, shapes and names, bytes; see `consat.network.wire`."""
 
 
 class Crossing(NamedTuple):
-    """What stands at the ends of links, on its way to the others.
+    """The messages of a round, one row per end of a link.
 
     Attributes:
-        message: of the protocol; one row of what it `speaks` of.
+        message: message of the protocol; one row per link or per pair, see `consat.protocols.Rounds.speaks`.
         told: (links,) ages, see `consat.protocols.agreement`.
-        word: of bodies; None where they can jump.
+        word: positions of bodies; None if bodies can jump.
     """
 
     message: Any
@@ -48,12 +48,12 @@ class Crossing(NamedTuple):
 
 
 class Held(NamedTuple):
-    """What an agent remembers of what it said.
+    """What an agent remembers of its messages.
 
     Attributes:
-        crossing: what the neighbours hold from it.
-        since: (pairs,) rounds since it last had news for them; `NEVER` before it has said anything.
-        place: (links, d) where bodies were a round ago; None where they can jump.
+        crossing: the messages that the neighbours hold.
+        since: (pairs,) rounds since the last news for each neighbour; `NEVER` before the first message.
+        place: (links, d) positions of bodies in the previous round; None if bodies can jump.
     """
 
     crossing: Crossing
@@ -62,20 +62,20 @@ class Held(NamedTuple):
 
 
 def due(since: Array, beat: Any) -> Array:
-    """Who repeats itself, so many rounds after its last news; beat: see `BEAT`."""
+    """(pairs,) whether a repetition is due `since` rounds after the last news. `beat`: see `BEAT`."""
     doubled = jnp.array([2.0**k for k in range(1, 12)])
     soon = jnp.any((since[:, None] == doubled[None]) & (doubled[None] < beat), axis=1)
     return (soon | (since % beat == 0.0)) & (since > 0)
 
 
 def passed(since: Array, fresh: Array, beat: Any) -> Array:
-    """Rounds since the last news, a round later."""
+    """(pairs,) rounds since the last news, one round later. `fresh`: (pairs,) whether there was news in this round."""
     later = since + 1.0
     return jnp.where(fresh, 1.0, jnp.where(later < NEVER, later, beat))
 
 
 def goes_on(crossing: Crossing) -> Crossing:
-    """What silence says where nothing gets lost: all as before, and ages one round later."""
+    """The meaning of silence if no message is lost: everything as before, and ages one round later."""
     word = crossing.word
     return crossing._replace(told=_later(crossing.told), word=None if word is None else word._replace(age=_later(word.age)))
 
@@ -87,21 +87,22 @@ def _later(age: Array) -> Array:
 def sifted(
     protocol: Rounds, solver: Solver, said: Crossing, held: Held, pair: Array, *, beat: Any, lasting: bool, talks: Array | None = None
 ) -> tuple[Crossing, Held, Array]:
-    """What crosses, what is held from then on, and who sends.
+    """Select the messages that are sent.
 
     Args:
-        protocol: of the agents.
-        solver: theirs.
-        said: what would be.
-        held: by the neighbours.
-        pair: (links,) to which neighbour each end leads.
-        beat: see `BEAT`; means nothing where nothing gets lost.
-        lasting: whether nothing gets lost, so that silence says that all is as before. Then what is held of the protocol does not hang on
-            what is said of bodies, and a run is the same wherever bodies are measured.
-        talks: (pairs,) whether whoever speaks there is awake; all are if None.
+        protocol: the protocol.
+        solver: local computations of the agents.
+        said: the new messages.
+        held: what the neighbours hold.
+        pair: (links,) index of the pair of each end.
+        beat: see `BEAT`; without effect if no message is lost.
+        lasting: whether no message is lost, so that silence means "as before". Then what is held of the protocol does not depend on
+            messages about bodies, and a run is the same wherever bodies are measured.
+        talks: (pairs,) whether the sender is awake; None if all are.
 
     Returns:
-        the crossing and what is held, both with old rows where nothing is sent, and (pairs,).
+        The messages that the receivers have, and what is held, both with the old rows where nothing is sent; and (pairs,) whether a message
+        is sent.
     """
     before = goes_on(held.crossing) if lasting else held.crossing
     most = jnp.inf if lasting else solver.hops + 1.0
@@ -127,7 +128,7 @@ def _any(links: Array, pair: Array, pairs: int) -> Array:
 
 
 def _moved(said: Crossing, held: Crossing, place: Array | None, most: Any, solver: Solver) -> Array:
-    """(links,) whether there is news of a body, or of those that are where they should be."""
+    """(links,) whether there is news of the position or the age of a body."""
     if said.word is None or held.word is None or place is None:
         return jnp.zeros(len(said.told), bool)
     away, step = (jnp.abs(said.word.position - other).max(axis=1, initial=0.0) for other in (held.word.position, place))
@@ -136,17 +137,17 @@ def _moved(said: Crossing, held: Crossing, place: Array | None, most: Any, solve
 
 
 def _aged(said: Array, held: Array, most: Any) -> Array:
-    """Where ages differ; above `most` they say no more than it does."""
+    """(links,) whether ages differ; ages above `most` are equivalent to it."""
     return jnp.minimum(said, most) != jnp.minimum(held, most)
 
 
 def chosen(goes: Array, new: Any, old: Any) -> Any:
-    """`new` in the rows that go, `old` in the others."""
+    """The rows of `new` where `goes` is true, else those of `old`."""
     return jax.tree.map(lambda a, b: jnp.where(goes.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
 def single(values: Array) -> Array:
-    """The nearest numbers of 32 bits, as numbers of 64."""
+    """The values rounded to 32 bits, as 64-bit numbers."""
     largest = float(jnp.finfo(jnp.float32).max)
     rounded = jnp.clip(values, -largest, largest).astype(jnp.float32).astype(values.dtype)
     return jnp.where(jnp.isfinite(values), rounded, values)

@@ -41,7 +41,7 @@ class Stage(NamedTuple):
     team: Team
     present: frozenset[str]
 
-    def there(self) -> tuple[Team, np.ndarray]:
+    def present_team(self) -> tuple[Team, np.ndarray]:
         """The team of the agents that are present, and their indices in `team`."""
         places = np.array([i for i, agent in enumerate(self.team.ids) if agent in self.present])
         return (self.team, places) if len(places) == self.team.count else (self.team.part(places)[0], places)
@@ -239,6 +239,6 @@ def _relinked(stage: Stage, command: str, agents: tuple[str, ...]) -> Team:
 def _require_connected(stage: Stage, key: str, where: str) -> None:
     """Raises: InvalidTeam: a cluster of the present agents would not be connected by links."""
     try:
-        require_connected(stage.there()[0])
+        require_connected(stage.present_team()[0])
     except InvalidTeam as error:
         raise InvalidTeam([replace(fault, path=(key,), where=where) for fault in error.faults]) from None

@@ -134,7 +134,7 @@ class Observer:
                 self.records[event["id"]].take(event)
 
     @property
-    def there(self) -> list[AgentRecord]:
+    def present_records(self) -> list[AgentRecord]:
         """The records of the agents that are present."""
         return [record for agent, record in self.records.items() if agent in self.present]
 
@@ -144,14 +144,14 @@ class Observer:
         Some agents may know that all agents they can hear of are satisfied, while others know that the team is infeasible. Then the result
         is ``infeasible``.
         """
-        known = [record.known for record in self.there]
+        known = [record.known for record in self.present_records]
         if None in known:
             return None, None
-        return "infeasible" if "infeasible" in known else "satisfied", max(record.known_from or 0.0 for record in self.there)
+        return "infeasible" if "infeasible" in known else "satisfied", max(record.known_from or 0.0 for record in self.present_records)
 
     def concluded(self) -> float | None:
         """The stamp from which all agents know the final outcome, or None."""
-        since = [record.settled_from for record in self.there]
+        since = [record.settled_from for record in self.present_records]
         return None if None in since else max(stamp for stamp in since if stamp is not None)
 
     def settled(self, window: float, distance: float) -> bool:
@@ -161,10 +161,10 @@ class Observer:
             window: length of the time to look back, in units of stamps.
             distance: motion up to this on each axis counts as none, length.
         """
-        if any(record.report is None or not all(peer["up"] for peer in record.report["peers"].values()) for record in self.there):
+        if any(record.report is None or not all(peer["up"] for peer in record.report["peers"].values()) for record in self.present_records):
             return False
-        latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in self.there)
-        return all(record.moved(latest - window) <= distance for record in self.there)
+        latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in self.present_records)
+        return all(record.moved(latest - window) <= distance for record in self.present_records)
 
     def positions(self) -> np.ndarray:
         """(N, d) current positions of the bodies, length."""
@@ -216,7 +216,7 @@ class Observer:
         dt = tick if self.clock == "round" else SAMPLE
         times = steps * (tick if self.clock == "round" else 1.0)
         margins, smooth = _margins(stages, position, times, nu)
-        final, there = stages[-1].there()
+        final, there = stages[-1].present_team()
         sent = sum((record.sent for record in self.records.values()), Counter[str]())
         still = len(stages) == 1 and not final.moves
         margin, position = margins.min(axis=1), position[:, there]
@@ -282,7 +282,7 @@ def _margins(stages: Sequence[Stage], position: np.ndarray, times: np.ndarray, n
     which = np.searchsorted([stage.since for stage in stages], times, side="right") - 1
     for k in np.unique(which):
         rows = which == k
-        team, there = stages[k].there()
+        team, there = stages[k].present_team()
         live = Live.of(team, 1.0, all_of_them=False)
         found = _margins_at(Objective.at_positions(team), live, on_device(position[:, there]), on_device(times), nu)
         margins[np.ix_(rows, there)], smooth[rows] = (np.asarray(each)[rows] for each in found)

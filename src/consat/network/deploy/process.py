@@ -93,14 +93,14 @@ class Restart(NamedTuple):
     membership: Membership
 
 
-def run_agent(part: Part, settings: NodeSettings, options: ProcessOptions, again: Callable[[], Part] | None = None) -> None:
+def run_agent(part: Part, settings: NodeSettings, options: ProcessOptions, reread: Callable[[], Part] | None = None) -> None:
     """Run one agent until it is done or told to stop.
 
     Args:
         part: local problem of the agent.
         settings: its mode and rate.
         options: options of the process.
-        again: reads the part from its file again; None if the part has no file.
+        reread: reads the part from its file again; None if the part has no file.
 
     Raises:
         NetworkError: its address is in use, or its keys are not usable.
@@ -119,28 +119,28 @@ def run_agent(part: Part, settings: NodeSettings, options: ProcessOptions, again
     with Output() as output, heeding_signals(orders):
         commander = Commander(part.me, dimension, measured, options.sensor_timeout, output.write)
         core = core_of(part, settings)
-        _warm(core)
+        _compile(core)
         begin = Restart(part, core, Membership(part))
-        told = _wait_to_join(begin, orders, again, output.write) if options.standby else begin
+        outcome = _wait_to_join(begin, orders, reread, output.write) if options.standby else begin
         end = math.inf if options.until is None else time.monotonic() + options.until
         try:
             with ThreadPoolExecutor(1) as reader:
-                own = _Own(body, orders, commander, again, reader, deque(), end, output.write)
-                while isinstance(told, Restart):
-                    told = _live(told, settings, options, own)
+                kept = _Kept(body, orders, commander, reread, reader, deque(), end, output.write)
+                while isinstance(outcome, Restart):
+                    outcome = _run_part(outcome, settings, options, kept)
         except BaseException:
             commander.halt()
             raise
 
 
-class _Own(NamedTuple):
+class _Kept(NamedTuple):
     """Objects that are kept when the part is reloaded.
 
     Attributes:
         body: the body of the agent.
         orders: orders and measurements from stdin.
         commander: sends velocity commands to the body.
-        again: reads the part from its file; None if the part has no file.
+        reread: reads the part from its file; None if the part has no file.
         reader: thread that reads and compiles a new part.
         reading: the reload order in progress, with its future result; at most one.
         end: time on the monotonic clock at which the process ends, s.
@@ -150,40 +150,40 @@ class _Own(NamedTuple):
     body: Body
     orders: Orders
     commander: Commander
-    again: Callable[[], Part] | None
+    reread: Callable[[], Part] | None
     reader: Executor
     reading: deque[tuple[Order, Future[tuple[Part, Embodied] | str]]]
     end: float
     write: Callable[[dict[str, Any]], None]
 
 
-def _live(begin: Restart, settings: NodeSettings, options: ProcessOptions, own: _Own) -> Restart | str:
+def _run_part(begin: Restart, settings: NodeSettings, options: ProcessOptions, kept: _Kept) -> Restart | str:
     """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
     part = begin.part
     with _transport(part, settings, options) as transport:
         runner = runner_of(
-            part, settings, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=own.body, log=own.write,
+            part, settings, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=kept.body, log=kept.write,
             core=begin.core,
         )  # fmt: skip
         station = runner.station
         station.membership.adopt(begin.membership)
         station.log("start", mode=settings.mode, run=part.run, pid=os.getpid(), rounds=settings.mode == "lockstep")
         try:
-            told = _loop(runner, transport, own, options)
+            outcome = _loop(runner, transport, kept, options)
         except BaseException:
-            own.commander.halt()  # before the transport is closed, which may take long
+            kept.commander.halt()  # before the transport is closed, which may take long
             raise
-        if isinstance(told, str):
-            own.commander.halt()
+        if isinstance(outcome, str):
+            kept.commander.halt()
             station.send_goodbye()
         station.report()
-        if isinstance(told, str):
-            station.log("end", why=told, cpu=round(time.process_time(), 3))
-        return told
+        if isinstance(outcome, str):
+            station.log("end", why=outcome, cpu=round(time.process_time(), 3))
+        return outcome
 
 
-def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptions) -> Restart | str:
-    station, orders, commander = runner.station, own.orders, own.commander
+def _loop(runner: Runner, transport: Transport, kept: _Kept, options: ProcessOptions) -> Restart | str:
+    station, orders, commander = runner.station, kept.orders, kept.commander
     known_since = math.inf
     while True:
         commander.sense(orders)
@@ -191,49 +191,49 @@ def _loop(runner: Runner, transport: Transport, own: _Own, options: ProcessOptio
         now = time.monotonic()
         commander.sense(orders)  # measurements that arrived during the step
         commander.steer(station.target)
-        if (restart := _obey(runner, own)) is not None:
+        if (restart := _execute_orders(runner, kept)) is not None:
             return restart
         known_since = min(known_since, now) if station.settled else math.inf
         if runner.done:
             return "done"
         if orders.stopped:
             return orders.stopped
-        if now >= own.end:
+        if now >= kept.end:
             return "out of time"
         if options.stop == "satisfied" and now - known_since >= LINGER:
             return str(station.known)
         transport.wait(min(max(due - now, 0.0), NAP))
 
 
-def _obey(runner: Runner, own: _Own) -> Restart | None:
+def _execute_orders(runner: Runner, kept: _Kept) -> Restart | None:
     """Carry out the orders from stdin and log those that are rejected. Returns the state to continue with once a reload is done.
 
     A new part is read and compiled in a separate thread. Meanwhile the agent continues as before, and later orders wait.
     """
-    station, orders = runner.station, own.orders
+    station, orders = runner.station, kept.orders
     for line, why in orders.rejected():
         station.log("rejected", line=line, why=why)
-    while not own.reading:
+    while not kept.reading:
         if (order := orders.next()) is None:
             break
         if order.command == "reload":
-            own.reading.append((order, own.reader.submit(_renewed, station.part, station.core, own.again)))
-        elif (refusal := _heed(runner, order)) is not None:
+            kept.reading.append((order, kept.reader.submit(_reloaded, station.part, station.core, kept.reread)))
+        elif (refusal := _execute(runner, order)) is not None:
             station.log("rejected", line=order.line, why=refusal)
     if orders.leaving:
         orders.leaving = False
-        own.commander.halt()
+        kept.commander.halt()
         station.log("leaving")
         runner.leave()
-    if own.reading and own.reading[0][1].done():
-        order, found = own.reading.popleft()
-        if isinstance(told := found.result(), tuple):
-            return _carried(station, *told)
-        station.log("rejected", line=order.line, why=told)
+    if kept.reading and kept.reading[0][1].done():
+        order, found = kept.reading.popleft()
+        if isinstance(outcome := found.result(), tuple):
+            return _restart(station, *outcome)
+        station.log("rejected", line=order.line, why=outcome)
     return None
 
 
-def _carried(station: Station, part: Part, core: Embodied) -> Restart:
+def _restart(station: Station, part: Part, core: Embodied) -> Restart:
     """The state after a reload, starting from the current estimates. New copies start at the agent's estimate of its own position, as in
     `consat.protocols.estimates.Estimates.carried`."""
     known = station.estimates
@@ -244,16 +244,16 @@ def _carried(station: Station, part: Part, core: Embodied) -> Restart:
     )
 
 
-def _renewed(before: Part, core: Embodied, again: Callable[[], Part] | None) -> tuple[Part, Embodied] | str:
-    """The part read from its file again, with a compiled core; or the reason why it cannot be used."""
-    if again is None:
+def _reloaded(before: Part, core: Embodied, reread: Callable[[], Part] | None) -> tuple[Part, Embodied] | str:
+    """The part read again from its file, with a compiled core; or the reason why it cannot be used."""
+    if reread is None:
         return NO_FILE
     try:
-        part = _fitting(again(), before)
-        fresh = core.among(frozenset(), part)
+        part = _fitting(reread(), before)
+        fresh = core.without(frozenset(), part)
     except (InvalidInput, InvalidSettings, OSError) as error:
         return "; ".join(str(error).splitlines())
-    _warm(fresh)
+    _compile(fresh)
     return part, fresh
 
 
@@ -269,7 +269,7 @@ def _fitting(part: Part, before: Part) -> Part:
     return part
 
 
-def _heed(runner: Runner, order: Order) -> str | None:
+def _execute(runner: Runner, order: Order) -> str | None:
     """Carry out an order. Returns None, or one line that says why it was rejected."""
     if order.command == "join":
         return "the agent is in the team already"
@@ -285,7 +285,7 @@ def _heed(runner: Runner, order: Order) -> str | None:
 
 
 def _wait_to_join(
-    begin: Restart, orders: Orders, again: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
+    begin: Restart, orders: Orders, reread: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
 ) -> Restart | str:  # fmt: skip
     """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
     part, core = begin.part, begin.core
@@ -298,24 +298,24 @@ def _wait_to_join(
         for line, why in orders.rejected():
             write("rejected", line=line, why=why)
         while (order := orders.next()) is not None:
-            told: Any = "the agent has not joined yet"
+            outcome: Any = "the agent has not joined yet"
             if order.command == "join":
                 return Restart(part, core, Membership(part))
             if order.command == "clock":
-                told, part = None, replace(part, epoch=float(order.given["epoch"]))
+                outcome, part = None, replace(part, epoch=float(order.given["epoch"]))
             elif order.command == "reload":
-                told = _renewed(part, core, again)
-            if isinstance(told, tuple):
-                part, core = replace(told[0], epoch=told[0].epoch or part.epoch), told[1]
-            elif told is not None:
-                write("rejected", line=order.line, why=told)
+                outcome = _reloaded(part, core, reread)
+            if isinstance(outcome, tuple):
+                part, core = replace(outcome[0], epoch=outcome[0].epoch or part.epoch), outcome[1]
+            elif outcome is not None:
+                write("rejected", line=order.line, why=outcome)
         time.sleep(NAP)
     why = orders.stopped or "told to leave"
     write("end", why=why, cpu=round(time.process_time(), 3))
     return why
 
 
-def _warm(core: Embodied) -> None:
+def _compile(core: Embodied) -> None:
     """Compile the core by running one turn, so that no neighbour waits for the compilation later."""
     moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
     _, _, view = core.turn(core.begin(core.part.first), *core.empty(), moment)

@@ -1,7 +1,7 @@
-"""What an agent computes, apart from how its messages travel: a protocol, compiled for its own part, and what it knows of bodies.
+"""The protocol compiled for one agent, independent of transport and timing.
 
-A core turns what has come since its last turn into its next state and what it says next: one row of numbers for each end of a link, and one
-for each neighbour. `Embodied` adds to any core the agreement about bodies.
+A core takes the messages received since its last step, and returns its next state and the messages to send: one row of numbers for each end
+of a link, and one for each neighbour. `Embodied` adds to any core the exchange of body positions, and the agreement that all are satisfied.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from consat.protocols.interior_point import near
 from consat.protocols.local.proximal import Memory
 
 LARGEST: Final = 1e100
-"""No number that agents send is larger, margins apart, as none in a scenario is: squares stay finite."""
+"""Largest magnitude of a number in a message, except margins. It is that of a number in a scenario; its square is finite."""
 PENALTY: Final = 1e80
-"""No ρ is larger that agents tell each other in ADMM, in the team's own unit of length: forces are rescaled by its changes. One that is
-not positive makes the state NaN, which `consat.network.node.guard` does not let happen."""
+"""Largest penalty ρ in a message of ADMM, in the team's unit of length, because forces are rescaled by changes of ρ. A ρ that is not
+positive makes the state NaN, which `consat.network.node.guard` prevents."""
 
 
 class Moment(NamedTuple):
-    """What a turn may ask about time.
+    """Inputs of a step besides messages.
 
     Attributes:
-        round: which turn it is, from 0.
-        elapsed: since the last turn, s.
-        delay: (E,) how long messages take over each end, s.
-        fresh: (E,) whether the neighbour at the other end was heard lately.
-        body: (d,) where the agent's body is, NaN where that is not known.
-        margin: ᾱ_i there, and where it last heard that the others are; −∞ where that is not known.
-        time: by the clock that the team shares, s since t = 0; what schedules go by.
+        round: number of the step, from 0.
+        elapsed: time since the last step, s.
+        delay: (E,) time that messages take over each end of a link, s.
+        fresh: (E,) whether the neighbour at the other end was heard recently.
+        body: (d,) position of the agent's body; NaN if unknown.
+        margin: ᾱ_i at this position and the last received positions of the other bodies; −∞ if unknown.
+        time: time for schedules, by the clock that the team shares, s since t = 0.
     """
 
     round: float
@@ -56,16 +56,16 @@ class Moment(NamedTuple):
 
 
 class AgentView(NamedTuple):
-    """What an agent sees of itself after a turn.
+    """What an agent knows after a step.
 
     Attributes:
         x: (rows, d) its estimates.
-        bodies: (rows, d) where its own body is, and where it last heard that the others are.
-        heard: whether it has heard of all of them.
-        known: for how many turns it has known that all are satisfied, by their bodies.
-        bound: proven to be at least the best margin that the team can have; +∞ without proof.
-        least: the least margin of the team's bodies that it knows of; −∞ while it has not heard of all.
-        near: whether that is proven to be near the best.
+        bodies: (rows, d) last known positions of the bodies.
+        heard: whether it has received the positions of all these bodies.
+        known: number of steps for which it has known that all agents are satisfied at the positions of their bodies.
+        bound: proven upper bound on the best margin of the team; +∞ without proof.
+        least: smallest margin of the team at the positions of the bodies, as received; −∞ until all have been received.
+        near: whether `least` is proven to be near the best margin.
     """
 
     x: np.ndarray
@@ -78,11 +78,11 @@ class AgentView(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What an agent says or hears in a turn.
+    """Messages that an agent sends or receives in a step.
 
     Attributes:
-        link: (E, width) for each end of a link.
-        pair: (G, W) for each neighbour that is there, in the order of the part, padded to the longest.
+        link: (E, width) one row for each end of a link.
+        pair: (G, W) one row for each neighbour that is present, in the order of the part, padded to the longest.
     """
 
     link: np.ndarray
@@ -90,12 +90,12 @@ class Rows(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """What comes of a turn of a protocol.
+    """Result of a step of a protocol.
 
     Attributes:
-        state: the next.
-        outbox: what to send.
-        x: (rows, d) the estimates.
+        state: the next state.
+        outbox: messages to send.
+        x: (rows, d) estimates.
         bound: see `AgentView`.
         least: see `AgentView`.
     """
@@ -112,52 +112,52 @@ class Core(Protocol):
 
     @property
     def part(self) -> Part:
-        """Whose."""
+        """The agent's part, without absent agents."""
         ...
 
     @property
     def ends(self) -> Sequence[tuple[str, str]]:
-        """(neighbour, agent) for each end; see `consat.network.node.problem.ends`."""
+        """(neighbour, agent) for each end of a link; see `consat.network.node.problem.ends`."""
         ...
 
     @property
     def width(self) -> int:
-        """How many numbers an end sends."""
+        """Number of entries of a row for an end of a link."""
         ...
 
     @property
     def largest(self) -> np.ndarray:
-        """(width,) the largest magnitude that each of them may have."""
+        """(width,) largest allowed magnitude of each entry."""
         ...
 
     @property
     def pair_numbers(self) -> Mapping[str, Numbers]:
-        """What it says to each neighbour besides, whoever is there."""
+        """Format of the row for each neighbour, whether or not it is present."""
         ...
 
     @property
     def solver(self) -> OwnSolver:
-        """Of the part."""
+        """Solver of the part."""
         ...
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> Any:
-        """The state from first estimates, (rows, d), at a time of the shared clock, s."""
+        """Initial state, from initial estimates `first`, (rows, d). `time`: see `Moment.time`."""
         ...
 
     def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
-        """Hear what arrived, where `arrived`, (E,) and (G,), and take a step."""
+        """Compute a step. `arrived`: masks, (E,) and (G,), of the rows of `inbox` that were received."""
         ...
 
-    def among(self, gone: Collection[str], whole: Part | None = None) -> Core:
-        """The same protocol when these agents are not there, on another part if one is given."""
+    def without(self, gone: Collection[str], whole: Part | None = None) -> Core:
+        """The core without the agents `gone`, for the part `whole` if it is given."""
         ...
 
     def carry(self, other: Core, state: Any, first: np.ndarray, time: float = 0.0) -> Any:
-        """The state that `state` of an `other` core becomes in this one; what is new begins from `first`, (rows, d)."""
+        """The state of this core that continues `state` of the core `other`. New rows start from `first`, (rows, d)."""
         ...
 
     def without_proofs(self, state: Any) -> Any:
-        """The state when constraints have changed: what was proven with others holds no more."""
+        """The state without proofs, which become invalid when constraints change."""
         ...
 
 
@@ -165,7 +165,7 @@ _Any = TypeVar("_Any", bound=Any)
 
 
 def adjusted(core: _Any, whole: Part) -> _Any:
-    """A core with other parameters of its constraints: those of a part that differs in nothing else. Nothing compiles."""
+    """Copy of a core with other constraint parameters. Nothing is compiled. `whole`: a part that differs only in these parameters."""
     other = copy.copy(core)
     other.whole, other.part = whole, whole.without(set(core.whole.team.ids) - set(core.part.team.ids))
     other.solver = replace(core.solver, live=live_of(other.part))
@@ -173,7 +173,7 @@ def adjusted(core: _Any, whole: Part) -> _Any:
 
 
 class IndexMap(NamedTuple):
-    """Which rows and ends of another core live on: the index there, −1 where new."""
+    """For each row and each end of a core the index in another core; −1 for new ones."""
 
     row: np.ndarray
     link: np.ndarray
@@ -188,7 +188,7 @@ class IndexMap(NamedTuple):
         )
 
     def merge(self, per: str | Mapping[str, Any], old: Any, fresh: Any) -> Any:
-        """`old` where it lives on, else `fresh`; `per` as in `consat.protocols.Rounds.per`."""
+        """The values `old` where they have an index, else `fresh`. `per`: see `consat.protocols.Rounds.per`."""
         if isinstance(per, str):
             index = {"row": self.row, "link": self.link}.get(per)
             return old if index is None else jax.tree.map(functools.partial(_take, index), old, fresh)
@@ -203,7 +203,7 @@ def _take(index: np.ndarray, old: Array, fresh: Array) -> Array:
 
 
 def no_pair_numbers(whole: Part) -> Mapping[str, Numbers]:
-    """Of a protocol that speaks for each end of a link only."""
+    """`Core.pair_numbers` of a protocol that sends rows for ends of links only."""
     return {neighbour.id: Numbers((0,)) for neighbour in whole.neighbours}
 
 
@@ -213,7 +213,7 @@ class _RoundState(NamedTuple):
 
 
 class RoundCore:
-    """A protocol in rounds on one agent, with the ages of `consat.protocols.agreement` by which it paces itself."""
+    """Core of a protocol in rounds, with the counters of `consat.protocols.agreement`."""
 
     def __init__(self, protocol: Rounds, whole: Part, gone: Collection[str] = ()) -> None:
         self.protocol = protocol
@@ -224,7 +224,7 @@ class RoundCore:
         self._begin, self._turn, *_ = _compiled()
         self.layout = _Layout.of(protocol, self.solver, self.part.team.dimension)
         self.width = sum(self.layout.sizes) + 1
-        # A single number is ρ in admm; in others it may be a margin, which is infinite of an agent without constraints.
+        # In admm a scalar is ρ. In other protocols it may be a margin, which is infinite for an agent without constraints.
         single = PENALTY / whole.length**2 if protocol.name == "admm" else np.inf
         self.largest = np.array([*(LARGEST if shape else single for shape, size in self.layout.each for _ in range(size)), LARGEST])
         self.pair_numbers = no_pair_numbers(whole)
@@ -237,20 +237,20 @@ class RoundCore:
         now, outbox = self._turn(self.protocol, self.layout, self.solver, state, heard, (moment.round, moment.margin, moment.time))
         return StepResult(now, Rows(np.asarray(outbox), inbox.pair), np.asarray(now.state.x))
 
-    def among(self, gone: Collection[str], whole: Part | None = None) -> RoundCore:
+    def without(self, gone: Collection[str], whole: Part | None = None) -> RoundCore:
         return RoundCore(self.protocol, whole or self.whole, gone)
 
     def without_proofs(self, state: _RoundState) -> _RoundState:
-        """Nothing is proven in it; that constraints hold is counted afresh in every turn."""
+        """The state unchanged: it contains no proofs."""
         return state
 
     def carry(self, other: Core, state: _RoundState, first: np.ndarray, time: float = 0.0) -> _RoundState:
-        """Only the estimates live on: the rest has settled on a problem that is no more, what is known of its satisfaction included."""
+        """Initial state with the old estimates. The rest of the state belongs to the old problem."""
         return self.begin(np.asarray(IndexMap.of(self, other).merge("row", state.state.x, first)), time)
 
 
 class _Outline:
-    """A solver that gives what a true one gives, but for the values: enough to find the shape of a message, and quick to trace."""
+    """Solver whose results have the right shapes but arbitrary values. It is fast to trace, to find the shape of a message."""
 
     def __init__(self, solver: OwnSolver) -> None:
         self.links, self.length, self.hops, self.convex = solver.links, solver.length, solver.hops, solver.convex
@@ -273,14 +273,14 @@ class _Outline:
 
 
 class _Layout(NamedTuple):
-    """What a message consists of: its structure, and for each array the shape of what one end sends."""
+    """Structure of a message, and for each of its arrays the shape for one end of a link."""
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
     def of(cls, protocol: Rounds, solver: OwnSolver, dimension: int) -> _Layout:
-        """Found by tracing, not by running."""
+        """Find the layout by tracing, without computing."""
         first, outline = jax.ShapeDtypeStruct((len(solver.holder), dimension), float), _Outline(solver)
 
         def message(x: Array) -> Any:
@@ -299,7 +299,7 @@ class _Layout(NamedTuple):
         return zip(self.shapes, self.sizes, strict=True)
 
     def unpack(self, packed: Array) -> Any:
-        """(E, Σ sizes) → the message."""
+        """The message from its rows, (E, Σ sizes)."""
         stops = np.cumsum(self.sizes)
         leaves = [
             packed[:, stop - size : stop].reshape(len(packed), *shape)
@@ -337,15 +337,15 @@ def _turn(
 
 
 def known_of(ages: agreement.Ages, fresh: Array | np.ndarray) -> agreement.Ages:
-    """Of a neighbour that has fallen silent nothing is known."""
+    """The counters, with those of silent neighbours set to 0."""
     return ages._replace(heard=jnp.where(fresh, ages.heard, 0.0))
 
 
 class EmbodiedState(NamedTuple):
-    """What an agent remembers.
+    """State of an agent.
 
     Attributes:
-        core: the state of its core.
+        core: state of its core.
         bodies: see `consat.protocols.agreement`.
     """
 
@@ -357,10 +357,11 @@ _PER_BODIES: Final[Mapping[str, Any]] = {"position": "row", "stale": "row", "age
 
 
 class Embodied:
-    """Any core, with word of where the bodies are: d coordinates, for how many turns they have been on their way, and an age.
+    """A core that also exchanges positions of bodies. It appends d + 2 entries to each row of a link: the position, the number of steps
+    since it was measured, and the number of rounds for which all are satisfied.
 
     Args:
-        core: the protocol on the agent.
+        core: the core of the protocol.
     """
 
     def __init__(self, core: Core) -> None:
@@ -371,15 +372,15 @@ class Embodied:
         self.largest = np.append(core.largest, np.full(dimension + 2, LARGEST))
         self.pair_numbers = core.pair_numbers
         self.ages = (*([core.width - 1] if core.width else []), self.width - 1)
-        """Columns of the rows that say for how many rounds something has held."""
+        """Columns of the rows of links that count rounds."""
         self._owners, (*_, self._start, self._agree, self._margin) = owners_of(self.part), _compiled()
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
-        """The state from first estimates, (rows, d), at a time of the shared clock, s."""
+        """See `Core.begin`."""
         return EmbodiedState(self.core.begin(first, time), self._start(self.core.solver, first))
 
     def turn(self, state: EmbodiedState, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[EmbodiedState, Rows, AgentView]:
-        """See `Core.turn`; and what the agent then sees of itself."""
+        """See `Core.turn`. Returns the next state, the messages to send, and what the agent then knows."""
         width = self.core.width
         bodies, said, sight = self._agree(
             self.core.solver, self._owners, state.bodies, (inbox.link[:, width:], arrived.link, moment.fresh), moment.body, moment.time
@@ -393,19 +394,19 @@ class Embodied:
         return EmbodiedState(inner.state, bodies), Rows(link, inner.outbox.pair), view
 
     def empty(self) -> tuple[Rows, Rows]:
-        """Nothing has come: an inbox, and what in it has arrived."""
+        """An inbox and its masks of arrival, without messages."""
         neighbours = [neighbour.id for neighbour in self.part.neighbours]
         longest = max((self.pair_numbers[neighbour].shape[0] for neighbour in neighbours), default=0)
         inbox = Rows(np.zeros((len(self.ends), self.width)), np.zeros((len(neighbours), longest)))
         return inbox, Rows(*(np.zeros(len(rows), dtype=bool) for rows in inbox))
 
     def margin(self, positions: np.ndarray, time: float = 0.0) -> float:
-        """ᾱ_i at a time of the shared clock, s, were the agents of the part at these positions, (rows, d); +∞ without constraints."""
+        """ᾱ_i at the positions, (rows, d), of the agents of the part; +∞ without constraints. `time`: see `Moment.time`."""
         return float(np.asarray(self._margin(self.core.solver, positions, time))[0])
 
-    def among(self, gone: Collection[str], whole: Part | None = None) -> Embodied:
-        """The same when these agents are not there, on another part if one is given."""
-        return Embodied(self.core.among(gone, whole))
+    def without(self, gone: Collection[str], whole: Part | None = None) -> Embodied:
+        """See `Core.without`."""
+        return Embodied(self.core.without(gone, whole))
 
     def adjusted(self, whole: Part) -> Embodied:
         """See `adjusted`."""
@@ -416,14 +417,14 @@ class Embodied:
         return state._replace(core=self.core.without_proofs(state.core))
 
     def carry(self, other: Embodied, state: EmbodiedState, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
-        """See `Core.carry`. Where bodies are lives on; who is satisfied does not."""
+        """See `Core.carry`. Positions of bodies are kept; the counters of satisfied rounds restart."""
         fresh = self._start(self.core.solver, first)
         bodies = IndexMap.of(self, other).merge(_PER_BODIES, state.bodies, fresh)._replace(ages=fresh.ages)
         return EmbodiedState(self.core.carry(other.core, state.core, first, time), bodies)
 
 
 def owners_of(part: Part) -> agreement.Owners:
-    """Whose positions the agent of a part holds, and from whom it takes word of their bodies."""
+    """The agents whose positions the agent of a part holds, and the ends of links over which it accepts positions of their bodies."""
     place, pairs = {agent: row for row, agent in enumerate(part.team.ids)}, ends(part)
     row = np.array([place[agent] for _, agent in pairs], dtype=np.int64)
     direct = np.array([neighbour == agent for neighbour, agent in pairs], dtype=bool)
@@ -454,7 +455,7 @@ class _Programs(NamedTuple):
 
 @functools.cache
 def _compiled() -> _Programs:
-    """Compiled once for all agents of the same shape."""
+    """The compiled functions, which all agents of the same shape share."""
     options = quick_compilation()
 
     def start(solver: OwnSolver, first: Array) -> agreement.Bodies:

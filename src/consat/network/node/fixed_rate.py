@@ -92,7 +92,7 @@ class FixedRate:
         self._begun = all(heard) or late
         if self._begun:
             self._due = self._last = now
-            self._state = station.core.begin(station.among(station.first()), station.now())
+            self._state = station.core.begin(station.present_rows(station.first()), station.now())
         return self._begun
 
     def _turn(self, now: float) -> None:
@@ -101,7 +101,7 @@ class FixedRate:
             self._state = station.regroup(self._state, station.first())
             self._regrouped = self._count
         self._state = station.check_restarts(self._state)
-        inbox, arrived = station.empty()
+        inbox, arrived = station.core.empty()
         for neighbour, told in self._latest.items():
             station.deliver(neighbour, told, inbox, arrived)
         self._latest.clear()

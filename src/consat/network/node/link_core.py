@@ -93,7 +93,7 @@ class LinkCore:
         state, outbox = self._turn(self.solver, gains, state, inbox.link, arrived.link, moment)
         return StepResult(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
 
-    def among(self, gone: Collection[str], whole: Part | None = None) -> LinkCore:
+    def without(self, gone: Collection[str], whole: Part | None = None) -> LinkCore:
         return LinkCore(whole or self.whole, self.k1, self.k2, gone)
 
     def without_proofs(self, state: LinkState) -> LinkState:

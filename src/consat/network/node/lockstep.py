@@ -86,7 +86,7 @@ class Lockstep:
                 station.send_hello()
             return self._sent_at + RESEND
         if self._state is None and station.body.position() is not None:
-            self._state = station.core.begin(station.among(station.first()))
+            self._state = station.core.begin(station.present_rows(station.first()))
         if self._state is not None:
             if station.changed:
                 self._regroup()
@@ -119,12 +119,12 @@ class Lockstep:
             elif message.kind is Kind.SAME:
                 reached = int(message.arrays[0][0])
                 before = self._blocks[message.source].get(reached - 1)
-                if before is not None and reached <= self._round:  # else the neighbour is asked to say it all
+                if before is not None and reached <= self._round:  # else the neighbour will be asked for the whole message
                     self._reached[message.source] = reached
                     self._take(message.source, reached, self.station.same(before), before)
 
     def _take(self, neighbour: str, reached: int, current: Sequence[np.ndarray], previous: Sequence[np.ndarray]) -> None:
-        """Keep what a neighbour said in a round and in the one before."""
+        """Store a neighbour's messages of round `reached` and of the round before it."""
         blocks = self._blocks[neighbour]
         due = {self._round - 1: blocks[self._round - 1]} if self._round - 1 in blocks else {}
         self._blocks[neighbour] = due | {reached: current, reached - 1: previous}
@@ -160,7 +160,7 @@ class Lockstep:
 
     def _turn(self, now: float) -> None:
         station = self.station
-        inbox, arrived = station.empty()
+        inbox, arrived = station.core.empty()
         for neighbour in station.present if self._round else ():  # no messages before the first round
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
                 station.deliver(neighbour, block, inbox, arrived)
@@ -186,7 +186,7 @@ class Lockstep:
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
     def _send(self, now: float, among: AbstractSet[str] | None = None) -> None:
-        """Say what there is to say of this round; that nothing is new to those who are not `among` some."""
+        """Send the message of this round to the neighbours in `among` (None for all), and to the others that it brings no news."""
         station = self.station
         assert self._outbox is not None
         current, previous = (station.blocks(outbox) for outbox in self._outbox)
@@ -222,7 +222,7 @@ class Lockstep:
         if min(rows, default=0) >= 0 and not self._outbox[0].pair.size:
             self._outbox = self._among(rows, self._outbox[0]), self._among(rows, self._outbox[1])
         else:  # an agent has joined, or messages per neighbour refer to the old membership: compute new messages
-            inbox, nothing = station.empty()
+            inbox, nothing = station.core.empty()
             self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
             outbox, _ = station.filter(outbox)
             self._outbox = outbox, outbox
@@ -237,7 +237,7 @@ class Lockstep:
 
     def _size(self) -> int:
         """Largest size of the stored record, in bytes: that with all agents present."""
-        everyone = self.station.core.among(frozenset())
+        everyone = self.station.core.without(frozenset())
         state = everyone.begin(self.station.part.first)
         longest = max((numbers.shape[0] for numbers in everyone.pair_numbers.values()), default=0)
         said = len(everyone.ends) * everyone.width + len(everyone.part.neighbours) * longest
@@ -274,9 +274,9 @@ class Lockstep:
                 at += np.size(leaf)
             return jax.tree.unflatten(structure, restored)
 
-        nothing, _ = station.empty()
+        nothing, _ = station.core.empty()
         self._outbox = read(nothing), read(nothing)
-        self._state = read(station.core.begin(station.among(station.part.first)))
+        self._state = read(station.core.begin(station.present_rows(station.part.first)))
         station.resume(self._outbox[0], self._state)
         station.log("resumed", round=self._round)
         self._send(station.clock())

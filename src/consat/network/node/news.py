@@ -1,4 +1,4 @@
-"""For whom an agent has news, where it sends nothing else: `consat.protocols.sending`, over the rows that it says."""
+"""With ``sends=events``, decides to which neighbours an agent sends. Applies `consat.protocols.sending` to the rows of one agent."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Sent(NamedTuple):
     """What an agent remembers of what it sent.
 
     Attributes:
-        rows: what the neighbours hold.
+        rows: the rows that the neighbours hold.
         since: see `consat.protocols.sending.Held`.
-        place: likewise.
+        place: see `consat.protocols.sending.Held`.
     """
 
     rows: Rows
@@ -34,16 +34,16 @@ class Sent(NamedTuple):
 
 
 class NewsFilter:
-    """Of one core.
+    """Keeps what the neighbours hold from an agent, and selects the messages that contain news.
 
     Args:
-        core: whose rows they are.
-        beat: turns after which it repeats itself; ∞ where nothing gets lost, and silence says that all is as before.
+        core: the agent's core.
+        beat: number of steps after which a message is repeated. ∞ if no message is lost, so that silence means "as before".
     """
 
     def __init__(self, core: Embodied, beat: float) -> None:
         inner = core.core
-        assert isinstance(inner, RoundCore | PairCore), "of a protocol in rounds"
+        assert isinstance(inner, RoundCore | PairCore), "mode link sends everything"
         self._core, self._inner, self._beat = core, inner, beat
         order = [neighbour.id for neighbour in core.part.neighbours]
         self._pair = jnp.asarray(np.array([order.index(neighbour) for neighbour, _ in core.ends], dtype=np.int32))
@@ -54,12 +54,17 @@ class NewsFilter:
         self._sent = Sent(empty, np.full(len(order), NEVER), np.zeros((len(core.ends), shape[0])))
 
     def resume(self, rows: Rows, bodies: np.ndarray) -> None:
-        """Go on after what was said last; bodies: (rows, d) where they were then."""
+        """Continue after a restart.
+
+        Args:
+            rows: the rows that were sent last.
+            bodies: (rows, d) positions of the bodies at that time.
+        """
         place = np.asarray(self._core.core.solver.links.at(jnp.asarray(bodies)))
         self._sent = Sent(rows, np.ones(len(self._sent.since)), place)
 
     def filter(self, rows: Rows) -> tuple[Rows, np.ndarray]:
-        """What the neighbours hold after this turn, and (G,) to whom it has to be sent for that."""
+        """The rows that the neighbours hold after this step, and (G,) to which of them a message must be sent."""
         found = _compiled()(self._how, self._inner.solver, self._packing, rows, self._sent, (self._pair, self._beat))
         link, pair, since, place, goes = map(np.asarray, found)
         self._sent = Sent(Rows(link, pair), since, place)
@@ -67,8 +72,14 @@ class NewsFilter:
 
 
 class _How(NamedTuple):
-    """What a program is compiled for: protocol, structure of its message, dimension, width of its rows, neighbours, and whether silence
-    says that all is as before."""
+    """Static arguments of the compiled function.
+
+    Attributes:
+        protocol: the protocol.
+        layout: layout of its messages; None for messages per neighbour.
+        shape: dimension, width of the rows, and number of neighbours.
+        lasting: whether silence means "as before".
+    """
 
     protocol: Rounds
     layout: Any

@@ -95,7 +95,7 @@ class PairCore:
             row[at] = -1.0
         return said
 
-    def among(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
+    def without(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
         return PairCore(self.protocol, whole or self.whole, gone)
 
     def without_proofs(self, state: PairState) -> PairState:

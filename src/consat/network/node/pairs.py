@@ -1,5 +1,5 @@
-"""Serialisation of `consat.protocols.local.interior.Mail` as the numbers of a message. Of symmetric matrices only the upper triangle is
-stored, and only for variables that the two neighbours share:
+"""Serialisation of `consat.protocols.local.interior.Mail` as the numbers of a message. It contains the variables that the two neighbours
+share; of symmetric matrices it contains the upper triangle:
 
     changes, μ, t, least margin, then upper triangle and vector of the quadratic; Σλ, c, error, then triangle and vector of the proof
 
@@ -75,8 +75,8 @@ class MessageLayout(NamedTuple):
         largest[0], largest[3] = MOST, np.inf
         return largest
 
-    def brief(self) -> tuple[Numbers, Numbers]:
-        """What its halves must be, see `halves`, where few bytes count."""
+    def half_numbers(self) -> tuple[Numbers, Numbers]:
+        """Validity conditions of the two halves of a message, see `halves`, which are sent with ``sends=events``."""
         short, rest = (tuple(half.tolist()) for half in halves(self._largest(), self.weight))
         return (
             Numbers((len(short),), short, functools.partial(_quadratic_sound, self.size), single=True),
@@ -85,17 +85,22 @@ class MessageLayout(NamedTuple):
 
 
 def halves(row: np.ndarray, weight: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of a message the numbers that may be rounded, μ, t, the least margin and the quadratic; and count and proof, which may not."""
+    """The entries of a message that may be rounded to 32 bits (μ, t, least margin, quadratic), and the others (count, proof).
+
+    Args:
+        row: the message.
+        weight: see `MessageLayout.weight`.
+    """
     return row[1:weight], np.concatenate([row[:1], row[weight:]])
 
 
 def whole(short: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The message of two halves."""
+    """The message from its two halves."""
     return np.concatenate([rest[:1], short, rest[1:]])
 
 
 def _both(size: int) -> int:
-    """Number of entries of a triangle and a vector."""
+    """Number of entries of a triangle and a vector of `size` variables."""
     return size * (size + 1) // 2 + size
 
 

@@ -22,7 +22,6 @@ from pydantic import Field, StringConstraints, ValidationError
 from consat.errors import AT_KEY, Fault, InvalidSettings, closest, counted, shown
 from consat.numerics import float64
 from consat.problem.agent import Agent
-from consat.problem.family import Family
 from consat.problem.objective import Nu
 from consat.problem.team import Team
 from consat.scenario import Scenario, dump
@@ -162,54 +161,44 @@ class Part:
         """The part without some agents: without constraints that read their positions, copies of these, and links to the agents."""
         if not gone:
             return self
-        kept = [number for number, agent in enumerate(self.team.ids) if agent not in gone]
-        degrees = {neighbour.id: dict(zip(neighbour.shares, neighbour.degrees, strict=True)) for neighbour in self.neighbours}
+        present = np.array([agent not in gone for agent in self.team.ids])
+        readable = [present[family.agents].all(axis=1) for family in self.team.families]
         neighbours = []
         for neighbour in self.neighbours:
             shares = tuple(agent for agent in neighbour.shares if agent not in gone)
             if shares and neighbour.id not in gone:
-                known = degrees[neighbour.id]
+                known = dict(zip(neighbour.shares, neighbour.degrees, strict=True))
                 kept_of = {
                     "shares": shares,
                     "degrees": tuple(known[agent] for agent in shares),
                     "travels": tuple(agent for agent in neighbour.travels if agent not in gone),
                 }
                 neighbours.append(neighbour.model_copy(update=kept_of))
-        return replace(self, team=_restricted(self.team, kept), first=self.first[kept], neighbours=tuple(neighbours))
+        return replace(
+            self,
+            team=_sub_team(self.team, np.flatnonzero(present), readable),
+            first=self.first[present],
+            neighbours=tuple(neighbours),
+        )
 
 
-def _restricted(team: Team, kept: Sequence[int]) -> Team:
-    """Sub-team of the agents `kept`, with the constraints that read only their positions."""
+def _sub_team(team: Team, kept: np.ndarray, chosen: Sequence[np.ndarray]) -> Team:
+    """Team of the agents `kept`, (n,), without starts, with the chosen constraints. `chosen`: (M_f,) a mask for each family."""
     place = np.full(team.count, -1, dtype=np.int32)
-    place[list(kept)] = np.arange(len(kept))
-    whole = [np.all(place[family.agents] >= 0, axis=1) for family in team.families]
-    numbers = np.sort(
-        np.concatenate([np.zeros(0, dtype=np.int32), *(family.number[stays] for family, stays in zip(team.families, whole, strict=True))])
-    )
-    families = [_members(family, np.flatnonzero(stays), place, numbers) for family, stays in zip(team.families, whole, strict=True)]
-    bare = Team([Agent(team.ids[i], (), team.starts[i] if np.isfinite(team.starts[i]).all() else None) for i in kept], [], team.dimension)
-    names = [team.names[int(number)] for number in numbers]
-    return bare.with_constraints([family for family in families if family.size], place[team.owner[numbers]], names)
-
-
-def _members(family: Family, which: np.ndarray, place: np.ndarray, numbers: np.ndarray) -> Family:
-    return replace(
-        family.members(which),
-        agents=place[family.agents[which]],
-        owner=place[family.owner[which]],
-        number=np.searchsorted(numbers, family.number[which]).astype(np.int32),
-    )
-
-
-def _private(team: Team, owner: int, held: np.ndarray) -> Team:
-    """The team as agent `owner` may know it: its own constraints, on the positions of the agents `held`."""
-    number = [np.flatnonzero(family.owner == owner) for family in team.families]
-    mine = np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(f.number[k] for f, k in zip(team.families, number, strict=True))]))
-    place = np.full(team.count, -1, dtype=np.int32)
-    place[held] = np.arange(len(held))
-    families = [_members(family, which, place, mine) for family, which in zip(team.families, number, strict=True)]
-    bare = Team([Agent(team.ids[int(i)]) for i in held], [], team.dimension)
-    return bare.with_constraints([f for f in families if f.size], place[team.owner[mine]], [team.names[int(k)] for k in mine])
+    place[kept] = np.arange(len(kept))
+    pairs = [(family, np.flatnonzero(mask)) for family, mask in zip(team.families, chosen, strict=True) if mask.any()]
+    numbers = np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(family.number[which] for family, which in pairs)]))
+    families = [
+        replace(
+            family.members(which),
+            agents=place[family.agents[which]],
+            owner=place[family.owner[which]],
+            number=np.searchsorted(numbers, family.number[which]).astype(np.int32),
+        )
+        for family, which in pairs
+    ]
+    bare = Team([Agent(team.ids[int(i)]) for i in kept], [], team.dimension)
+    return bare.with_constraints(families, place[team.owner[numbers]], [team.names[int(number)] for number in numbers])
 
 
 @float64
@@ -279,6 +268,7 @@ def split(
         rows = np.flatnonzero(copies.holder == owner)
         ends = copies.edges[np.isin(copies.edges[:, 0], rows)]
         others = copies.holder[ends[:, 1]]
+        own = _sub_team(team, copies.position[rows], [family.owner == owner for family in team.families])
         neighbours = []
         for other in np.unique(others):
             far, shares = ends[others == other, 1], rows_of[pair_of[owner, int(other)]]
@@ -294,7 +284,7 @@ def split(
             )
         parts[agent] = Part(
             scenario.name, run, agent, listen[owner], size.length, unit, size.center, size.reach, bool(concave.all()), shared.exact, across,
-            _private(team, owner, copies.position[rows]), common, first[rows], frozenset(absent), tuple(neighbours),
+            own, common, first[rows], frozenset(absent), tuple(neighbours),
             epoch, generation, size.extent, _robot(scenario.robots, agent),
         )  # fmt: skip
     return parts

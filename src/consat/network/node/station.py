@@ -78,7 +78,7 @@ class Station:
         self.membership = Membership(part)
         self._beat = beat
         self._filter = self._new_filter()
-        self._halves = {} if beat is None else _brief(part, core)
+        self._halves = {} if beat is None else _half_numbers_of(part, core)
         self.peers = Peers(
             part,
             part.problem(mode, "all" if beat is None else "events"),
@@ -114,7 +114,7 @@ class Station:
         self.regroup(None, part.first)
 
     def _new_filter(self) -> NewsFilter | None:
-        """Chooses what is sent for the core as it is now; None if everything is."""
+        """The filter of messages for the present core; None if everything is sent."""
         return None if self._beat is None else NewsFilter(self.core, self._beat)
 
     # -- membership --------------------------------------------------------------------------------------------------------------------
@@ -136,11 +136,11 @@ class Station:
             for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
-            before, self.core = self.core, self.core.among(gone)
+            before, self.core = self.core, self.core.without(gone)
             self._filter = self._new_filter()
             self._gone, self._view = gone, None
             if state is not None:
-                state = self.core.carry(before, state, self.among(first), self._time)
+                state = self.core.carry(before, state, self.present_rows(first), self._time)
         place = {end: k for k, end in enumerate(self.core.ends)}
         self._places = {
             neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
@@ -149,7 +149,7 @@ class Station:
         self._turn_of = {neighbour: k for k, neighbour in enumerate(self.present)}
         return state
 
-    def among(self, first: np.ndarray) -> np.ndarray:
+    def present_rows(self, first: np.ndarray) -> np.ndarray:
         """The rows of `first`, (copies, d), that belong to agents that are present."""
         return first[[agent not in self._gone for agent in self.part.team.ids]]
 
@@ -215,9 +215,9 @@ class Station:
             state = state and self.core.without_proofs(state)
         else:
             self.part = replace(self.part, team=changed(team, changes))
-            self.core = before.among(self._gone, self.part)
+            self.core = before.without(self._gone, self.part)
             self._filter = self._new_filter()
-            state = state and self.core.carry(before, state, self.among(self.first()), self._time)
+            state = state and self.core.carry(before, state, self.present_rows(self.first()), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state
 
@@ -253,10 +253,11 @@ class Station:
             outbox: messages of the core.
 
         Returns:
-            For each neighbour [block, letter]. Block: (shares, width + 1), the core's row of each shared position, 0 for absent agents, and
-            in the last column the membership number of each agent. MessageLayout: the core's row for this neighbour, 0 if it is absent.
+            For each neighbour a list of arrays. The first, (shares, width + 1), has the core's row of each shared position, 0 for absent
+            agents, and in the last column the membership number of each agent. The second is the core's row for this neighbour, 0 if it is
+            absent; with ``sends=events`` in mode interior-point it is split in two, see `consat.network.node.pairs.halves`.
         """
-        told = {}
+        arrays = {}
         for neighbour, place in self._places.items():
             block = np.zeros((len(place), self.core.width + 1))
             block[place >= 0, :-1] = outbox.link[place[place >= 0]]
@@ -265,24 +266,20 @@ class Station:
             if row is not None:
                 message = outbox.pair[row, : len(message)]
             short = self._halves.get(neighbour)
-            told[neighbour] = [block, *([message] if short is None else halves(message, 1 + short[0].shape[0]))]
-        return told
+            arrays[neighbour] = [block, *([message] if short is None else halves(message, 1 + short[0].shape[0]))]
+        return arrays
 
-    def empty(self) -> tuple[Rows, Rows]:
-        """Inbox and mask of arrival without messages."""
-        return self.core.empty()
-
-    def deliver(self, neighbour: str, told: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
+    def deliver(self, neighbour: str, arrays: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
         """Write a message into the inbox. Rows of links are used where both ends agree on the membership of the shared agent; the row of
         the neighbour is used where they agree on all shared agents.
 
         Args:
             neighbour: id of the sender.
-            told: [block, letter], or [block, letter in 32 bits, its proof]; see `blocks`.
+            arrays: the arrays of the message; see `blocks`.
             inbox: rows of the messages; modified.
             arrived: masks of arrival; modified.
         """
-        block, *pair = told
+        block, *pair = arrays
         message = pair[0] if len(pair) == 1 else whole(*pair)
         place, row = self._places[neighbour], self._turn_of.get(neighbour)
         same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
@@ -304,26 +301,26 @@ class Station:
         return done.state, done.outbox, done.view
 
     def filter(self, rows: Rows) -> tuple[Rows, AbstractSet[str]]:
-        """What the neighbours hold after this turn, and who has to be told for that: all, where all is sent."""
+        """The rows that the neighbours hold after this step, and the ids of those to which a message must be sent."""
         if self._filter is None:
             return rows, self.peers.all.keys()
         rows, goes = self._filter.filter(rows)
         return rows, self.peers.all.keys() - {self.present[k] for k in np.flatnonzero(~goes)}
 
     def resume(self, rows: Rows, state: Any) -> None:
-        """Go on after rows that were said before a restart, with the state of then."""
+        """Continue after a restart. `rows`: the rows that were sent last; `state`: the state at that time."""
         if self._filter is not None:
             self._filter.resume(rows, np.asarray(state.bodies.position))
 
-    def same(self, told: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """What a neighbour says by silence where nothing gets lost, given what it said a round ago."""
-        block = told[0].copy()
+    def same(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The message that a neighbour without news would have sent. `arrays`: the arrays of its previous message."""
+        block = arrays[0].copy()
         for column in self.core.ages:
             block[:, column] += block[:, column] > 0
-        return [block, *told[1:]]
+        return [block, *arrays[1:]]
 
     def send_same(self, round_: np.ndarray, to: Iterable[str]) -> None:
-        """Say that a round brought no news."""
+        """Tell the neighbours `to` that a round brought no news. `round_`: (1,) the round."""
         for neighbour in to:
             self.peers.send(neighbour, Kind.SAME, [round_])
 
@@ -333,14 +330,20 @@ class Station:
             self.peers.send(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
     def send(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
-        """Send a state message to all neighbours that are present, or to those in `to`. `arrays`: see `blocks`; `among`: limits both."""
+        """Send a state message.
+
+        Args:
+            arrays: see `blocks`.
+            to: ids of the receivers; None for all neighbours that are present.
+            among: send only to receivers in this set; None for no limit.
+        """
         for neighbour in self._listeners() if to is None else to:
             if among is None or neighbour in among:
                 single = [k for k, array in enumerate(arrays[neighbour]) if neighbour in self._halves and k % 3 == 1]
                 self.peers.send(neighbour, Kind.STATE, arrays[neighbour], tuple(single))
 
     def silent(self, among: AbstractSet[str]) -> list[str]:
-        """The neighbours that are not among those who are told."""
+        """The present neighbours that are not in `among`."""
         return [neighbour for neighbour in self._listeners() if neighbour not in among]
 
     def send_goodbye(self) -> None:
@@ -489,7 +492,16 @@ class Station:
 def _expected(
     shares: int, largest: np.ndarray, pair: Sequence[Numbers], frames: int, stamped: bool, *, same: bool
 ) -> Expected:  # fmt: skip
-    """Expected arrays of a neighbour's messages. The last number of each row is a membership number."""
+    """Expected arrays of a neighbour's messages.
+
+    Args:
+        shares: number of positions that both hold.
+        largest: (width,) largest magnitudes in a row; a membership number follows.
+        pair: formats of the row for the neighbour.
+        frames: see `Station`.
+        stamped: see `Station`.
+        same: whether the neighbour may send that a round brought no news.
+    """
     frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *pair]
     found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {
         Kind.HELLO: [(shares,)],
@@ -499,8 +511,8 @@ def _expected(
     return found | ({Kind.SAME: [(1,)]} if same else {})
 
 
-def _brief(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
-    """The halves of what is said to each neighbour as a whole, if anything is."""
+def _half_numbers_of(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
+    """For each neighbour the formats of the two halves of its row, in mode interior-point; else nothing."""
     if not isinstance(core.core, PairCore):
         return {}
-    return {neighbour.id: MessageLayout.of(neighbour, part.team.dimension).brief() for neighbour in part.neighbours}
+    return {neighbour.id: MessageLayout.of(neighbour, part.team.dimension).half_numbers() for neighbour in part.neighbours}
