@@ -7,13 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import jax.numpy as jnp
 import numpy as np
 
 from consat.errors import Fault, InvalidInput, closest, shown
+from consat.numerics import float64
+from consat.problem.team import Team
 from consat.robots.double import Double
 from consat.robots.fleet import Fleet
 from consat.robots.model import Model
-from consat.robots.obstacles import Obstacle, box, disc, polygon
+from consat.robots.obstacles import Obstacle, box, disc, map_of, polygon
 from consat.robots.point import Point
 from consat.robots.quadrotor import Quadrotor
 from consat.robots.unicycle import Unicycle
@@ -163,6 +166,31 @@ def _made(data: Any, kinds: Mapping[str, Any], where: str, example: str, base: M
     except InvalidInput as error:
         named = [f"{where}, {fault.path[0]}" if fault.path else where for fault in error.faults]
         raise InvalidInput(dataclasses.replace(fault, where=each) for fault, each in zip(error.faults, named, strict=True)) from None
+
+
+@float64
+def blocked_goals(robots: Robots, team: Team) -> list[str]:
+    """Warnings about goals, constraints of the kind ``within``, whose centre is in an obstacle or too close to one, one sentence each.
+
+    Args:
+        robots: robots and obstacles.
+        team: the team. Goals that move are checked at sample times.
+    """
+    size = np.broadcast_to(np.asarray(robots.fleet(list(team.ids)).radius, dtype=float), (team.count,))
+    found: dict[tuple[int, int], str] = {}
+    for instant in team.instants if robots.obstacles else ():
+        for family in (each for each in instant.families if each.kind == "within"):
+            for k, obstacle in enumerate(robots.obstacles):
+                gaps = np.asarray(map_of((obstacle,), team.dimension).signed_distance(jnp.asarray(family.parameters["center"])))
+                for row in np.flatnonzero(gaps < size[family.owner]).tolist():
+                    number, owner = int(family.number[row]), int(family.owner[row])
+                    free = gaps[row] + float(family.parameters["radius"][row]) >= size[owner]
+                    what = "the centre" if free else "no point"
+                    where = f"agent {team.ids[owner]!r}, constraint {team.names[number]!r}"
+                    stand = f"obstacles[{k}] ({type(obstacle).__name__.lower()})"
+                    clear = "is not clear" if free else "is clear"
+                    found[number, k] = f"{where}: {what} of the goal {clear} of {stand} by the radius of the robot"
+    return list(found.values())
 
 
 def _stacked(kind: Any, models: Sequence[Any]) -> Any:
