@@ -1,4 +1,4 @@
-"""The page of the view as text, for a server to serve or for a widget to frame."""
+"""The live page as text, for the server and for the widget."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from consat import __version__
 
 
 def page(name: str, reach: str = "'none'") -> tuple[str, str]:
-    """The page, and the policy that lets it run what it came with and nothing else.
+    """The page, and its content security policy, which allows its own script and style only.
 
     Args:
-        name: its title.
-        reach: what it may connect to, as a content security policy has it.
+        name: title of the page.
+        reach: source list of allowed connections.
     """
     views, own = resources.files("consat.views"), resources.files("consat.server")
     style = "".join((views / each).read_text(encoding="utf-8") for each in ("page.css", "live.css"))
