@@ -65,14 +65,19 @@ class Record:
             movement: weight of the distance, 0 to 1.
             longest: largest share of the moments within one recorded step, if there are enough steps.
         """
-        x, clock = self.x[: self.last + 1], self.steps[: self.last + 1] - float(self.steps[0])
-        way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
-        share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
-        steps, longest = np.diff(share), max(longest, 1.2 / max(1, len(share) - 1))
-        while steps.sum() > 0 and steps.max() > 1.01 * longest * steps.sum():
-            steps = np.minimum(steps, longest * steps.sum())
-        share = np.append(0.0, np.cumsum(steps))
-        return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
+        return spread(self.x[: self.last + 1], self.steps[: self.last + 1], count, movement, longest)
+
+
+def spread(x: np.ndarray, steps: np.ndarray, count: int, movement: float, longest: float = 1.0) -> np.ndarray:
+    """The moments of `Record.moments` for positions x, (T, N, d), at steps, (T,)."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
+    clock = np.asarray(steps, dtype=float) - float(steps[0])
+    share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
+    gaps, longest = np.diff(share), max(longest, 1.2 / max(1, len(share) - 1))
+    for _ in range(100 if longest < 1.0 else 0):  # cutting gaps makes the others larger, relative to the sum
+        gaps = np.minimum(gaps, longest * gaps.sum())
+    share = np.append(0.0, np.cumsum(gaps))
+    return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
 
 
 def between(series: np.ndarray, moment: Any) -> np.ndarray:

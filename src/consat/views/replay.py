@@ -7,20 +7,16 @@ are base64 of little-endian float32.
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.colors import to_hex
 
-from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
@@ -28,8 +24,9 @@ from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
 from consat.views.outlines import MOST, outlines
+from consat.views.page import page as assembled
 from consat.views.picture import FEW, MOST_SHAPES
-from consat.views.record import Record
+from consat.views.record import Record, spread
 from consat.views.shapes import Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
@@ -38,6 +35,9 @@ MOST_NUMBERS: Final = 2_000_000
 MOST_OUTLINED: Final = 40
 """Number of samples at which moving regions are written."""
 SPREAD: Final = 200
+"""Number of moments by which the page paces its time."""
+MOVEMENT: Final = 0.6
+"""Weight of the distance travelled in that pace; the rest is the clock."""
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> Path:
@@ -61,20 +61,14 @@ def page(result: Result) -> str:
     """The page as text; see `save`."""
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
-    files = resources.files("consat.views")
-    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "replay.js", "replay.html"))
     data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     summary = result.summary
     status = summary["status"]
     good = status == "satisfied"
-    policy = f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
     count = summary["count"]
     few = result.data.sizes["agent"] <= FEW
     parts = {
-        "policy": policy,
-        "version": __version__,
         "title": escape(f"{summary['scenario']}: {status}"),
-        "style": style,
         "name": escape(str(summary["scenario"])),
         "tone": "good" if good else "bad",
         "sign": "✓" if good else "✗",
@@ -85,13 +79,8 @@ def page(result: Result) -> str:
         "scale_hidden": "hidden" if few else "",
         "facts": "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in _facts(result)),
         "data": data,
-        "script": script,
     }
-    return re.sub(r"@(\w+)@", lambda found: parts[found[1]], html)
-
-
-def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    return assembled("replay", ("page.css",), parts)[0]
 
 
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
@@ -174,7 +163,7 @@ def document(result: Result) -> dict[str, Any]:
         "links": _packed(team.links if team is not None and len(team.links) <= MOST_SHAPES else np.zeros((0, 2)), "<i4"),
         "low": [round(float(value), 6) for value in low],
         "high": [round(float(value), 6) for value in high],
-        "spread": [round(float(value), 3) for value in _spread(x, steps)],
+        "spread": [round(float(value), 3) for value in spread(x, steps, SPREAD, MOVEMENT)],
         "scale": {"edges": edges, "shades": shades},
         "bodies": _bodies(result, data, chosen),
         "obstacles": [obstacle_data(each) for each in stand],
@@ -197,15 +186,7 @@ def _steps(x: np.ndarray) -> np.ndarray:
     most = max(2, MOST_NUMBERS // max(1, x.shape[1] * x.shape[2]))
     if len(x) <= most:
         return np.arange(len(x))
-    return np.unique(np.round(_spread(x, np.arange(len(x)), most)).astype(int))
-
-
-def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray:
-    """(count,) moments from first to last, spaced by a mean of distance travelled and clock."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(np.nan_to_num(x), axis=0), axis=(1, 2))))
-    clock = np.asarray(steps, dtype=float) - float(steps[0])
-    share = 0.6 * way / (way[-1] or 1.0) + 0.4 * clock / (clock[-1] or 1.0)
-    return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
+    return np.unique(np.round(spread(x, np.arange(len(x)), most, MOVEMENT)).astype(int))
 
 
 def _regions(
@@ -233,7 +214,7 @@ def _regions(
 
 def _moments(x: np.ndarray) -> np.ndarray:
     """Samples at which moving regions are written."""
-    return np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int))
+    return np.unique(np.round(spread(x, np.arange(len(x)), MOST_OUTLINED, MOVEMENT)).astype(int))
 
 
 def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
