@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -32,66 +32,57 @@ class Order(BaseModel):
     id: Number = None
     gesture: Number = None
 
+    about: ClassVar[tuple[str, ...]] = ()
+    """Fields that say what is set."""
+
     @property
     def subject(self) -> tuple[Any, ...] | None:
         """What the order sets. It replaces earlier orders of the same gesture with the same subject; None if it replaces none."""
-        return None
+        if not self.about:
+            return None
+        values = (getattr(self, name) for name in self.about)
+        keys = (tuple(sorted(value)) if isinstance(value, dict) else value for value in values)
+        return type(self).__name__, *keys, tuple(sorted(self.model_fields_set))
 
 
 class Change(Order):
     """Change parameters of a constraint."""
 
+    about = ("agent", "constraint", "parameters")
     do: Literal["change"]
     agent: Name
     constraint: Name
     parameters: Parameters
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The parameters of the constraint."""
-        return "change", self.agent, self.constraint, *sorted(self.parameters)
-
 
 class Shape(Order):
     """Move or resize a ball, given by its index in the scene, for all its owners."""
 
+    about = ("scene", "shape")
     do: Literal["shape"]
     scene: Place
     shape: Place
     center: Vector | None = None
     radius: float | None = None
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """Centre or radius, or both, of the ball."""
-        return "shape", self.scene, self.shape, self.center is None, self.radius is None
-
 
 class Wall(Order):
     """Move a half-space, given by its index in the scene, along its normal, for all its owners."""
 
+    about = ("scene", "wall")
     do: Literal["wall"]
     scene: Place
     wall: Place
     offset: float
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The offset of the half-space."""
-        return "wall", self.scene, self.wall
-
 
 class Put(Order):
     """Move an agent."""
 
+    about = ("agent",)
     do: Literal["place"]
     agent: Name
     position: Vector
-
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The position of the agent."""
-        return "place", self.agent
 
 
 class Add(Order):
