@@ -125,6 +125,24 @@ def test_faults_have_a_place_and_a_cure(change: tuple[str, str], message: str) -
     assert all(line.startswith("crossing.yaml:") for line in text.splitlines())
 
 
+def test_goals_in_obstacles_are_named() -> None:
+    from consat.scenario.robots import blocked_goals
+
+    goals = [
+        cs.Agent("a", [cs.within([3, 0], 0.3, name="goal")]),
+        cs.Agent("b", [cs.within([2, 0.9], 1.5)]),
+        cs.Agent("c", [cs.within([0, 0], 1), cs.within(cs.schedule([0, 5], [[0, 0], [9, 9]]), 0.2, name="later")]),
+    ]
+    stand = (cs.disc([9, 9], 1), cs.polygon([[2, -1], [4, -1], [4, 1], [2, 1]]))
+    robots = Robots(cs.Unicycle(radius=0.1), {}, stand)
+    assert blocked_goals(robots, cs.Team(goals)) == [
+        "agent 'a', constraint 'goal': no point of the goal is clear of obstacles[1] (polygon) by the radius of the robot",
+        "agent 'b', constraint 'within': the centre of the goal is not clear of obstacles[1] (polygon) by the radius of the robot",
+        "agent 'c', constraint 'later': no point of the goal is clear of obstacles[0] (disc) by the radius of the robot",
+    ]
+    assert blocked_goals(Robots(cs.Point(radius=0.1)), cs.Team(goals)) == []
+
+
 def test_obstacles_without_robots_are_a_fault() -> None:
     with pytest.raises(cs.InvalidScenario, match="no robots to keep clear of them"):
         cs.loads(CROSSING.replace("robots: {", "# {").replace("robot: {speed: 0.4}, ", ""))

@@ -307,9 +307,8 @@ def test_mcap_holds_bodies_headings_and_obstacles(tmp_path: Path) -> None:
 
 
 def test_a_film_dwells_on_no_round() -> None:
-    from consat.views.scene import Scene, moments
+    from consat.views.record import Record
 
-    scene = Scene(cs.run("case-b", rounds=30))
-    shown = moments(scene, 72, 0.75, 0.0625)
+    shown = Record(cs.run("case-b", rounds=30)).moments(72, 0.75, 0.0625)
     assert (shown[0], shown[-1]) == (0, 30)
     assert np.bincount(shown.astype(int)).max() <= 6

@@ -601,7 +601,7 @@ def test_scene_leaves_nothing_behind() -> None:
 
 def test_film_dwells_on_what_moves() -> None:
     shown = scene.Scene(made(tug(), GREETING, samples=400))
-    moments = scene.moments(shown, 100, animation.MOVEMENT)
+    moments = shown.record.moments(100, animation.MOVEMENT)
     assert moments[0] == 0
     assert moments[-1] == shown.last
     assert np.all(np.diff(moments) > 0)

@@ -57,7 +57,7 @@ class Double:
         return jnp.zeros(len(state.position))
 
     def stop(self, state: DoubleState, dt: float) -> Array:
-        """Braking is along the velocity: (s² − r²)/2A in whole steps, and r dt/2 in the last, which takes away what is left, r < A dt."""
+        """Braking along the velocity takes (s² − r²)/2A in whole steps, and r dt/2 in the last, which removes the rest, r < A dt."""
         speed = jnp.linalg.norm(state.velocity, axis=1)
         limit = each(self.acceleration, len(speed))
         left = speed - limit * dt * jnp.floor(speed / (limit * dt))
@@ -119,7 +119,7 @@ class Double:
         return limit * (jnp.sqrt(dt**2 + 2.0 * finite / limit) - dt)
 
     def approach(self, distance: Array, dt: float) -> Array:
-        """At half the acceleration, which leaves the other half for others."""
+        """Braking uses half of the acceleration. The other half remains for avoiding others."""
         braking = jnp.sqrt(each(self.acceleration, len(distance)) * distance)
         return jnp.minimum(jnp.minimum(self.pace(len(distance)), distance / (2.0 * dt)), braking)
 

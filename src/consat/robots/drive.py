@@ -1,7 +1,7 @@
-"""One control step of a team of robots: from where they want to be to what they do, and what came of it.
+"""One control step of a team of robots: from targets to commands, new states, and a report of distances.
 
-What each robot does depends on its own state and target, the public map, and what it measures of its neighbours; the arrays only hold all
-robots at once. `Drive.step` can be traced, with arrays of constant shape; paths round obstacles are planned apart (`planning`).
+The command of a robot depends on its own state and target, the public map, and what it measures of its neighbours. The arrays hold all
+robots only to compute them together. `Drive.step` can be traced. Paths around obstacles are planned elsewhere, see `planning`.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from consat.robots.obstacles import Map, map_of
 from consat.robots.simulated import Simulated
 
 PAIRS_COUNTED = 4000
-"""Up to so many robots every pair is remembered that ever touched; of more, touches are counted."""
+"""Most robots for which each pair that touched is remembered. With more robots, touches are only counted."""
 PATIENCE = 5.0
-"""A robot that is underway and came no nearer to its target for so long, s, is stuck."""
+"""Time without progress towards its target after which a robot that has not arrived counts as stuck, s."""
 
 
 class Memory(NamedTuple):
-    """What is carried from step to step; all but `known`, which only saves time, and `touched` is each robot's own.
+    """State that is carried from step to step. Each robot has its own, except `known`, which only saves time, `touched` and `report`.
 
     Attributes:
-        velocity: (N, d) as others measured it last.
-        blocked: (N,) right angles that each turns its wish by.
-        waypoint: (N,) the next waypoint of each path.
+        velocity: (N, d) velocities that others measured last, m/s.
+        blocked: (N,) angle by which each robot turns its wished velocity, in right angles.
+        waypoint: (N,) index of the next waypoint on each path.
         goal: (N, d) the target that `least` is about.
-        least: (N,) the shortest way left so far, m.
-        waited: (N,) since when it got no shorter, s.
-        known: who may be near.
-        touched: (N, N) pairs that ever touched; (0, 0) where they are only counted.
-        report: what came of it so far.
+        least: (N,) shortest remaining path length so far, m.
+        waited: (N,) time since it last became shorter, s.
+        known: candidates for the nearest neighbours.
+        touched: (N, N) whether a pair ever touched; (0, 0) if touches are only counted.
+        report: report of the steps so far.
     """
 
     velocity: Array
@@ -59,16 +59,16 @@ class Memory(NamedTuple):
 
 
 class Report(NamedTuple):
-    """From the start to now; all scalars unless said otherwise.
+    """Report of all steps so far. Entries without a shape are scalars.
 
     Attributes:
-        smallest_distance: between the surfaces of two bodies in range of each other, m; infinite where there were none.
-        clearance: from a body's surface to the nearest obstacle, m; infinite where there is none.
-        contacts: how many pairs ever touched (touches, of very many robots).
-        collisions: how many times a robot touched an obstacle, in steps.
-        halted: (N,) how many steps each robot was halted by the filter.
-        strayed: the farthest that a body was from where the filter took it to be, beyond what it allows for, m.
-        overlap: the most that two robots, or one and an obstacle, were nearer to each other than the filter keeps, m.
+        smallest_distance: smallest distance between the surfaces of two bodies in range of each other, m; infinite if there were none.
+        clearance: smallest distance from the surface of a body to an obstacle, m; infinite without obstacles.
+        contacts: number of pairs that touched; with more than `PAIRS_COUNTED` robots, of touches.
+        collisions: number of robots in contact with an obstacle, summed over the steps.
+        halted: (N,) number of steps in which the filter halted each robot.
+        strayed: largest distance of a body from its reference, beyond what the filter allows for, m.
+        overlap: largest violation of the distance that the filter keeps between robots, or to obstacles, m.
     """
 
     smallest_distance: Array
@@ -86,26 +86,26 @@ class Drive:
 
     Args:
         model: a model, or a `Fleet` of several.
-        count: N.
-        dimension: d.
+        count: number of robots, N.
+        dimension: dimension of space, d.
         dt: time between two commands, s.
         obstacles: public map.
-        noise: the most that a measured position may be wrong by, m; widens what is kept.
-        share: of a gap that may be used up in a step, in (0, 1].
-        neighbours: how many have a plane of their own; the others limit the speed.
-        parts: of obstacles, likewise.
-        sensing: range of the sensors, m; None for as far as the rules below look.
-        tolerance: a robot nearer to its target than this has arrived, m; None for its radius.
-        rules: against deadlock.
+        noise: largest error of a measured position, m. Kept distances grow with it.
+        share: fraction of a gap that may be used up in one step, in (0, 1].
+        neighbours: largest number of neighbours with a plane of their own. The others only limit the speed.
+        parts: largest number of parts of obstacles with a plane of their own.
+        sensing: range of the sensors, m; None for the range that `rules` need.
+        tolerance: distance from its target at which a robot has arrived, m; None for its radius.
+        rules: parameters of the rules against deadlock.
 
     Attributes:
         map: the obstacles as arrays.
-        size: (N,) the radius that each keeps round its place, m.
-        range: how far each looks, m.
-        explained: how deep an overlap may seem by noise alone, m.
+        size: (N,) radius that each robot keeps free around its place, m.
+        range: distance up to which each robot sees others, m.
+        explained: largest apparent overlap that noise alone can explain, m.
 
     Raises:
-        InvalidInput: a setting, or an obstacle, that cannot be used.
+        InvalidInput: a setting or an obstacle cannot be used.
     """
 
     model: Model[Any]
@@ -146,11 +146,11 @@ class Drive:
 
     @property
     def arrives(self) -> Array:
-        """(N,) how near to its target each has arrived, m."""
+        """(N,) distance from its target at which each robot has arrived, m."""
         return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
 
     def start(self, state: Any) -> Memory:
-        """The memory at the start, of the types that it has after a step: a weak type would have programs compiled once more."""
+        """The memory at the start. Its types are those after a step, because a weak type would cause a second compilation."""
         place = self.model.place(state)
         zeros, never = jnp.zeros(self.count), jnp.full(self.count, jnp.inf, dtype=jnp.float64)
         pairs = self.count if self.count <= PAIRS_COUNTED else 0
@@ -178,7 +178,7 @@ class Drive:
         measured: Array | None = None,
         wind: Array | None = None,
     ) -> tuple[Any, Memory, Array]:
-        """One step of dt.
+        """Advance by one step of `dt`.
 
         Args:
             state: of the model.
@@ -230,7 +230,7 @@ class Drive:
         return after, memory, command
 
     def observed(self, state: Any, memory: Memory) -> Memory:
-        """The memory with the present state in the report, which otherwise ends where the last step began."""
+        """The memory with the present state in its report. Without this call, the report ends where the last step began."""
         known, around = near(memory.known, self.model.place(state), self.neighbours, self.range)
         return self._looked_at(state, memory._replace(known=known), around)
 
@@ -239,15 +239,15 @@ class Drive:
         return self.observed(state, memory).report, ~self.arrived(state, targets) & (memory.waited > PATIENCE)
 
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
-        """Who has not arrived, and came no nearer to the target for `PATIENCE`, by index."""
+        """Indices of robots that have not arrived and made no progress for `PATIENCE`."""
         return np.flatnonzero(np.asarray(~self.arrived(state, targets) & (memory.waited > PATIENCE))).tolist()
 
     def arrived(self, state: Any, targets: Array) -> Array:
-        """(N,) who is within `tolerance` of its target."""
+        """(N,) whether each robot is within `tolerance` of its target."""
         return jnp.linalg.norm(targets - self.position(state), axis=1) < self.arrives
 
     def position(self, state: Any) -> Array:
-        """(N, d) the point that constraints see: the model's place, or where a simulator measures it."""
+        """(N, d) points that constraints read: the places of the model, or those that a simulator measures."""
         return self.model.position(state) if isinstance(self.model, Simulated) else self.model.place(state)
 
     def _way(self, waypoint: Array, place: Array, targets: Array, paths: Array | None) -> tuple[Array, Array, Array]:
@@ -273,7 +273,7 @@ class Drive:
         return waypoint, way / jnp.maximum(length, 1e-9)[:, None], length + rest
 
     def _looked_at(self, state: Any, memory: Memory, around: Near) -> Memory:
-        """The report brought up to date with where bodies are, given who is near."""
+        """The report with the present bodies, given the nearest neighbours."""
         body, place = self.model.body(state), self.model.place(state)
         radius, report = each(self.model.radius, self.count), memory.report
         kept = self.model.size(self.count, self.dt)
@@ -324,7 +324,7 @@ def _sizes(drive: Drive) -> tuple[np.ndarray, float, float]:
 
 
 def longest_halt(model: Model[Any], count: int, dt: float) -> np.ndarray:
-    """(N,) the way that a halt from full speed takes, m."""
+    """(N,) distance of a halt from full speed, m."""
     if not model.inertial:
         return np.zeros(count)
     pace, braking = np.asarray(model.pace(count)), np.asarray(model.braking(count))

@@ -1,4 +1,4 @@
-"""Robots of several kinds as one model: each kind computes for its own, and what all share is put together."""
+"""Robots of several kinds as one model. Each kind computes its own robots; the results are joined."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from consat.robots.model import Model
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """Several models, and which robots are of which.
+    """Several models, and the model of each robot.
 
-    The state is a tuple with that of each model; a command has as many columns as the widest needs, the others are 0.
+    The state is a tuple with the state of each model. A command has the columns of the widest model; the others are padded with 0.
 
     Args:
-        models: the kinds; parameters given for each robot are in the order of that kind's own robots.
+        models: the models. A parameter with one value per robot has the order of the robots of that model.
         kinds: (N,) the model of each robot, by index.
 
     Raises:
-        InvalidInput: a kind that is not there, or that no robot has.
+        InvalidInput: a number in `kinds` has no model, or a model has no robot.
     """
 
     models: Sequence[Model[Any]]
@@ -120,7 +120,7 @@ class Fleet:
         return self._joined([function(model, part, rows) for model, part, rows in zip(self.models, state, self.members, strict=True)])
 
     def _joined(self, parts: list[Array]) -> Array:
-        """Rows of each kind in the order of the robots; narrower ones are filled up with 0."""
+        """Join the rows of all models in the order of the robots. Narrower rows are padded with 0."""
         if parts[0].ndim == 2:
             width = max(part.shape[1] for part in parts)
             parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]

@@ -1,7 +1,7 @@
-"""What every robot model offers, and how its parameters are checked.
+"""Interface of all robot models, and the check of their parameters.
 
-A model holds parameters only; the state is passed in and returned. All functions take N robots at once, N = 1 in a process of its own, and
-can be traced by JAX. Positions have shape (N, d), in metres; times are in seconds and angles in radians.
+A model holds parameters only; the state is passed in and returned. All functions compute N robots at once and can be traced by JAX; a
+process of one robot has N = 1. Positions have shape (N, d), in metres; times are in seconds and angles in radians.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from jax import Array
 from consat.errors import Fault, InvalidInput, shown
 
 Number = float | np.ndarray
-"""A parameter: one number for all robots, or (N,) one for each."""
+"""A parameter: one number for all robots, or one for each, (N,)."""
 
 S = TypeVar("S")
 """The state of a model: a NamedTuple of arrays whose first axis is the robot."""
 
 LARGEST = 1e6
-"""Parameters beyond this are refused: their squares must stay far from where float64 ends."""
+"""Largest parameter that is accepted. Its square is far from the limits of float64."""
 
 
 class Model(Protocol, Generic[S]):
     """A robot model.
 
-    `place` is the point that constraints see and that the safety filter keeps apart from others by `size`. A robot that halts from now on
-    stays on the segment from `place` to `stop`; where it can halt at once, that is one point.
+    `place` is the point that constraints read. The safety filter keeps a disc of radius `size` around it free. A robot that halts from now
+    on stays on the segment from `place` to `stop`. If it can halt at once, the segment is a point.
     """
 
     @property
@@ -41,72 +41,69 @@ class Model(Protocol, Generic[S]):
 
     @property
     def inertial(self) -> bool:
-        """Whether a robot that halts moves on for a while; where not, `stop` is `place`."""
+        """Whether a robot that halts moves on for a while. If not, `stop` is `place`."""
 
     @property
     def radius(self) -> Number:
-        """Of the body, m."""
+        """Radius of the body, m."""
 
     def start(self, position: Array) -> S:
         """The state at rest whose `place` is `position`, (N, d)."""
 
     def place(self, state: S) -> Array:
-        """(N, d) the point that constraints see."""
+        """(N, d) points that constraints read."""
 
     def body(self, state: S) -> Array:
-        """(N, d) the center of the body's disc or ball, whose radius is `radius`."""
+        """(N, d) centres of the bodies, which are discs or balls."""
 
     def velocity(self, state: S, command: Array) -> Array:
-        """(N, d) velocity of `place` as others would measure it, under the command."""
+        """(N, d) velocity of `place` under the command, as others measure it, m/s."""
 
     def heading(self, state: S) -> Array:
-        """(N,) angle of the body in the plane, for drawings."""
+        """(N,) heading in the plane, rad, for drawings."""
 
     def stop(self, state: S, dt: float) -> Array:
-        """(N, d) where `place` comes to rest if the robot halts from now on, in steps of `dt`."""
+        """(N, d) point at which `place` comes to rest if the robot halts from now on, in steps of `dt`."""
 
     def size(self, count: int, dt: float) -> Array:
-        """(N,) radius of a disc around `place` that holds the body all through a step of `dt` whose ends the filter has checked."""
+        """(N,) radius of a disc around `place` that contains the body during a step of `dt`, if the filter has checked both ends, m."""
 
     def pace(self, count: int) -> Array:
-        """(N,) the speed limit."""
+        """(N,) speed limit, m/s."""
 
     def braking(self, count: int) -> Array:
-        """(N,) deceleration of a halt, m/s²; infinite where a robot halts at once."""
+        """(N,) deceleration of a halt, m/s²; infinite if a robot halts at once."""
 
     def command(self, state: S, velocity: Array, dt: float) -> Array:
-        """(N, m) the command within the model's limits whose mean velocity over `dt` is `velocity`, or points the same way where that is
-        out of reach."""
+        """(N, m) command within the limits whose mean velocity over `dt` is `velocity`; if out of reach, with the same direction."""
 
     def halt(self, state: S, dt: float) -> Array:
-        """(N, m) the command that stops as soon as the limits allow."""
+        """(N, m) command that stops as soon as the limits allow."""
 
     def step(self, state: S, command: Array, dt: float, wind: Array | None = None) -> S:
-        """The state after `dt` under a command that is held; commands beyond the limits are cut to them. `wind` is the velocity of the
-        air, (N, d), or None where there is none."""
+        """The state after `dt` under a constant command, cut to the limits. wind: (N, d) velocity of the air, m/s; None without wind."""
 
     def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
-        """(N, k) the least n·x, for k unit vectors (N, k, d) of each robot, that `place` comes to after this moment: in the step, at its
-        end, or in the halt that may follow. Without wind."""
+        """(N, k) smallest n·x of `place` during the step and a halt after it, for k unit vectors (N, k, d) of each robot. Without wind."""
 
     def rows(self, state: S, normals: Array, least: Array, dt: float) -> Array:
         """(N, k) b such that n·u ≥ b, for the next velocity u, keeps the step and the halt after it in n·x ≥ `least`."""
 
     def farthest(self, state: S, command: Array, dt: float) -> Array:
-        """(N,) a bound on how far from where it is now `place` comes within the step and the halt that may follow. Without wind."""
+        """(N,) upper bound on the distance of `place` from its present point during the step and a halt after it, m. Without wind."""
 
     def bounded(self, slack: Array, dt: float) -> Array:
-        """(N,) the speed at which a step and the halt after it take no more than `slack`, m."""
+        """(N,) speed at which a step and a halt after it cover at most the distance `slack`, m."""
 
     def approach(self, distance: Array, dt: float) -> Array:
-        """(N,) the speed at which to be, this far before the end of the way."""
+        """(N,) speed at a distance, m, from the end of the path."""
 
     def reach(self, state: S, dt: float) -> tuple[Array, Array]:
         """Center (N, d) and radius (N,) of a ball of velocities that can be reached within `dt`."""
 
 
 def each(value: Number, count: int) -> Array:
-    """(N,) of a parameter that is one number for all or one for each."""
+    """(N,) values of a parameter, one for each robot."""
     return jnp.broadcast_to(jnp.asarray(value, dtype=jnp.float64), (count,))
 
 

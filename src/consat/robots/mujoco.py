@@ -1,8 +1,8 @@
-"""Bodies in MuJoCo: quadrotors and differential drives, made of primitive shapes and written as MJCF, among the obstacles of the map.
+"""Bodies in MuJoCo: quadrotors and differential drives of primitive shapes, written as MJCF, among the obstacles of the map.
 
-A quadrotor has four rotors whose thrust is limited, under the geometric controller of `consat.robots.quadrotor`; a differential drive has
-two driven wheels and a caster on a floor with friction, and its steered point follows that of the reference. All have the same drag in the
-air. Contacts are MuJoCo's, between what the models call bodies: the ball of a quadrotor, the disc of a drive.
+A quadrotor has four rotors with limited thrust, under the geometric controller of `consat.robots.quadrotor`. A differential drive has two
+driven wheels and a caster on a floor with friction; its steered point follows that of its reference. All have the same drag in the air.
+MuJoCo detects contacts between the bodies of the models: the ball of a quadrotor, the disc of a drive.
 """
 
 from __future__ import annotations
@@ -23,49 +23,49 @@ from consat.robots.simulated import Bodies, kinds_of
 from consat.robots.unicycle import Unicycle, UnicycleState
 
 SOLID = {"contype": 1, "conaffinity": 1}
-"""Bodies and obstacles, which collide with each other."""
+"""Attributes of bodies and obstacles, which collide with each other."""
 ROLLING = {"contype": 2, "conaffinity": 2}
-"""Wheels, casters and the floor, likewise."""
+"""Attributes of wheels, casters and the floor, which collide with each other."""
 SHOWN = {"contype": 0, "conaffinity": 0, "mass": 0}
-"""What is only to be seen."""
+"""Attributes of shapes that are only drawn."""
 TALL = 10.0
-"""Half the height of obstacles in the plane, m."""
+"""Half the height of obstacles of the plane, m."""
 
 LIFT, INERTIA = 2.0, (0.15, 0.15, 0.27)
-"""Of a quadrotor: the most that its rotors lift, in weights; its inertia, in mass·radius²."""
+"""Quadrotor: largest thrust, relative to the weight; moments of inertia, in mass·radius²."""
 ARM, YAW = 0.6, 0.1
-"""In radii: length of its arms, and the moment of a rotor about its axis for its thrust."""
+"""Quadrotor, in radii: length of the arms; ratio of a rotor's drag moment to its thrust."""
 MIXER = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])
-"""Thrust, and moments about three axes, of rotors at (+, +), (−, +), (−, −) and (+, −); neighbours turn against each other."""
+"""Signs of thrust and of the moments about three axes, for rotors at (+, +), (−, +), (−, −) and (+, −). Neighbours counter-rotate."""
 RATES = 60.0
-"""Of the loop that follows turn rates, 1/s."""
+"""Gain of the turn-rate loop, 1/s."""
 LEARNING, LEARNT = 15.0, 3.0
-"""Of the integral part that takes up a steady wind, 1/s³, and the most that it comes to, m/s²."""
+"""Integral action against a steady wind: gain, 1/s³, and limit, m/s²."""
 
 WHEEL, TRACK, CASTER = 0.35, 0.85, 0.75
-"""Of a drive, in radii: radius of its wheels, half the distance between them, and how far the caster is behind the axle."""
+"""Drive, in radii: radius of the wheels, half the distance between them, distance of the caster behind the axle."""
 HIGH, BEHIND = 0.3, 0.2
-"""In radii: how high the middle of its mass is above the floor, and how far behind the axle."""
+"""Drive, in radii: height of the centre of mass above the floor, and its distance behind the axle."""
 SPIN = 0.4
-"""Moment of inertia about the vertical, in mass·radius²."""
+"""Drive: moment of inertia about the vertical axis, in mass·radius²."""
 SERVO, GRIP = 0.01, 6.0
-"""Time constant of the wheels' speed loop, s, and the acceleration that their motors are good for, m/s²."""
+"""Drive: time constant of the wheels' speed loop, s; largest acceleration by the motors, m/s²."""
 FOLLOWING = 8.0
-"""Of the loop that follows the reference, 1/s."""
+"""Drive: gain of the loop that follows the reference, 1/s."""
 MORE = 1.25
-"""How much more than the reference's limits it may ask for."""
+"""Drive: largest speed of that loop, relative to the limits of the reference."""
 REST, LAG = 0.01, 0.025
-"""Of the tube of a drive: m, and s."""
+"""Drive: constant part of the tube, m, and time that multiplies the speed, s."""
 
 
 class _Physics(NamedTuple):
-    """What MuJoCo has of N robots; leading axis N, padded with 0.
+    """State of N robots in MuJoCo. Missing entries are padded with 0.
 
     Attributes:
-        place: (N, 9) of position, unit quaternion, angles of two wheels.
-        speed: (N, 8) of velocity in the world, turn rate in the body, turn rates of two wheels.
-        warm: (N, 8) the last accelerations, from which contacts are solved.
-        push: (N, 3) of quadrotors the acceleration against the wind, m/s².
+        place: (N, 9) position, unit quaternion, angles of two wheels.
+        speed: (N, 8) velocity in the world frame, turn rate in the body frame, turn rates of two wheels.
+        warm: (N, 8) last accelerations, the initial guess of the contact solver.
+        push: (N, 3) acceleration of quadrotors against the wind, m/s².
     """
 
     place: np.ndarray
@@ -75,7 +75,7 @@ class _Physics(NamedTuple):
 
 
 class _Now(NamedTuple):
-    """What n robots of a kind know of themselves: see `_Physics`; attitude: (n, 3, 3); mass: (n,), kg; inertia: (n, 3), kg m²."""
+    """Measurements of n robots of a kind: as in `_Physics`, and attitude, (n, 3, 3); mass, (n,), kg; inertia, (n, 3), kg m²."""
 
     place: np.ndarray
     speed: np.ndarray
@@ -86,20 +86,20 @@ class _Now(NamedTuple):
 
 
 _Control = Callable[[_Now, float, float], tuple[np.ndarray, np.ndarray]]
-"""From what is measured, the time since the step began, and how long motors hold, s, to (n, motors) what they do, and the new push."""
+"""Controller: from measurements, time since the step began, s, and hold time, s, to motor inputs, (n, motors), and the new push."""
 
 
 class _Design(NamedTuple):
-    """How the robots of a kind are built and controlled.
+    """Construction and control of the robots of a kind.
 
     Attributes:
-        step: of the physics and of the controller, s, at most.
-        motors: of each robot.
-        joints: of its own, beside the six of a free body.
-        height: of the body's frame above the floor, in radii; 0 of what flies.
-        tube: how far a body may be from its reference, m.
-        body: writes one: into the world, and into the actuators; of its name and radius.
-        control: from two states of the references, dt apart.
+        step: largest time step of physics and controller, s.
+        motors: number of motors of each robot.
+        joints: number of joints besides the six degrees of freedom of the body.
+        height: height of the body's frame above the floor, in radii; 0 for flying robots.
+        tube: largest allowed distance of a body from its reference, m, from the model.
+        body: writes a body of a name and radius to the world and the actuators.
+        control: makes the controller for two states of the references, dt apart.
     """
 
     step: float
@@ -112,7 +112,7 @@ class _Design(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Robots of one kind: their model, which rows they are, (n,) their radii, how they are built, and (n, motors) their actuators."""
+    """Robots of one kind: model, indices, (n,), radii, (n,), design, and indices of the actuators, (n, motors)."""
 
     kind: Any
     rows: np.ndarray
@@ -125,13 +125,13 @@ class Simulator:
     """See `consat.robots.simulated.Simulator`.
 
     Args:
-        model: of the robots: `Quadrotor`, `Unicycle` or a `Fleet` of both.
-        count: N.
-        dimension: d.
-        obstacles: the public map.
+        model: model of the robots: `Quadrotor`, `Unicycle` or a `Fleet` of both.
+        count: number of robots, N.
+        dimension: dimension of space, d.
+        obstacles: public map.
 
     Attributes:
-        mjcf: the scene, as a document for MuJoCo.
+        mjcf: MJCF of the scene.
 
     Raises:
         InvalidSettings: MuJoCo is not installed, or a kind of robot has no body here.
@@ -164,7 +164,7 @@ class Simulator:
         numbers = np.full(compiled.nbody, count)
         numbers[self._bodies] = np.arange(count)
         solid = compiled.geom_contype == SOLID["contype"]
-        self._owner = np.where(solid, numbers[compiled.geom_bodyid], -1)  # N of obstacles, −1 of what has no part in contacts
+        self._owner = np.where(solid, numbers[compiled.geom_bodyid], -1)  # N: obstacle; −1: not solid
 
     def start(self, place: np.ndarray) -> Bodies:
         count = len(place)
@@ -206,7 +206,7 @@ class Simulator:
         return Bodies(place[:, :3], speed[:, :3], heading, np.concatenate(physics, axis=1), touching, struck)
 
     def _look(self, touching: np.ndarray, struck: np.ndarray) -> None:
-        """Add MuJoCo's contacts between two robots, and between one and an obstacle."""
+        """Record contacts between two robots, and between a robot and an obstacle."""
         contact = self._data.contact
         pairs = np.sort(self._owner[contact.geom], axis=1)[contact.dist < 0.0]
         first, second = pairs[pairs[:, 0] >= 0].T
@@ -215,7 +215,7 @@ class Simulator:
         struck[first[~robots]] = True
 
     def _each(self, value: Callable[[_Group], Any]) -> np.ndarray:
-        """(N,) from what is known of each kind."""
+        """(N,) values, from one value, or one for each robot, of each kind."""
         values = np.zeros(sum(len(group.rows) for group in self._groups))
         for group in self._groups:
             values[group.rows] = value(group)
@@ -223,7 +223,7 @@ class Simulator:
 
 
 class _Slots(NamedTuple):
-    """Where the numbers of each robot stand in one of MuJoCo's vectors, and in an array of N rows, padded with 0."""
+    """Places of each robot's entries in a vector of MuJoCo, and in an array of N rows that is padded with 0."""
 
     row: np.ndarray
     column: np.ndarray
@@ -232,7 +232,7 @@ class _Slots(NamedTuple):
 
     @classmethod
     def of(cls, first: np.ndarray, own: np.ndarray, width: int) -> _Slots:
-        """Args: first: (N,) where those of each robot begin; own: (N,) how many they are; width: of the rows."""
+        """Args: first: (N,) index of each robot's first entry; own: (N,) number of its entries; width: length of the rows."""
         row, column = np.nonzero(np.arange(width)[None] < own[:, None])
         return cls(row, column, first[row] + column, (len(first), width))
 
@@ -249,7 +249,7 @@ class _Slots(NamedTuple):
 
 
 def _flown(kind: Quadrotor, before: DoubleState, after: DoubleState, dt: float) -> _Control:
-    """The thrust of four rotors, N, from thrust and moments as in Lee, Leok, McClamroch, CDC 2010."""
+    """Controller of quadrotors: thrust of four rotors, N, from thrust and moments as in Lee, Leok, McClamroch, CDC 2010."""
     begin, old, new = map(_in_space, (before.position, before.velocity, after.velocity))
     pull = (new - old) / dt
     levers = np.broadcast_to(kind.radius, len(begin))[:, None] * np.array([ARM, ARM, math.sqrt(2.0) * YAW]) / math.sqrt(2.0)
@@ -267,7 +267,7 @@ def _flown(kind: Quadrotor, before: DoubleState, after: DoubleState, dt: float) 
 
 
 def _quadrotor(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:
-    """A ball around a hull, four arms and rotors, which are only to be seen."""
+    """A ball. The hull, four arms and the rotors inside are only drawn."""
     dark, grey, red = "0.2 0.2 0.25 1", "0.5 0.5 0.55 0.8", "0.8 0.3 0.2 0.8"
     body = _add(world, "body", name=name)
     _add(body, "freejoint")
@@ -288,7 +288,7 @@ def _quadrotor(world: ElementTree.Element, actuators: ElementTree.Element, name:
 
 
 def _rolled(kind: Unicycle, before: UnicycleState, after: UnicycleState, dt: float) -> _Control:
-    """The speeds of two wheels, rad/s: the steered point ahead of the axle follows that of the reference."""
+    """Controller of drives: speeds of two wheels, rad/s. The steered point ahead of the axle follows that of the reference."""
     axle, angle, half = np.asarray(before.axle), np.asarray(before.angle), 0.5 * np.asarray(after.angle - before.angle)
     chord = np.sum((after.axle - axle) * _ahead(angle + half), axis=1)
     pace, rate = chord / (dt * np.sinc(half / np.pi)), 2.0 * half / dt
@@ -309,13 +309,15 @@ def _rolled(kind: Unicycle, before: UnicycleState, after: UnicycleState, dt: flo
 
 
 def _late(kind: Unicycle) -> Any:
-    """How far a drive falls behind its reference, m; measured with random commands. When that halts at once its body comes to stand where
-    its steered point was, which is kept free anyway."""
+    """Largest distance of a drive behind its reference, m, measured with random commands.
+
+    If the reference halts at once, the body stops at its steered point, which is kept free anyway.
+    """
     return REST + kind.speed * (LAG + kind.turn_rate * kind.radius * LAG)
 
 
 def _drive(world: ElementTree.Element, actuators: ElementTree.Element, name: str, radius: float) -> None:
-    """A disc with a wheel on either side and a caster behind; its frame is at the middle of the axle."""
+    """A disc with a wheel on each side and a caster behind. Its frame is at the middle of the axle."""
     wheel, ball = WHEEL * radius, 0.15 * radius
     body = _add(world, "body", name=name)
     _add(body, "freejoint")
@@ -339,7 +341,7 @@ DESIGNS: dict[type, _Design] = {
     Quadrotor: _Design(0.005, 4, 0, 0.0, lambda kind: kind.tube, _quadrotor, _flown),
     Unicycle: _Design(0.0025, 2, 2, WHEEL, _late, _drive, _rolled),
 }
-"""The kinds of robots that have a body here."""
+"""The design of each kind of robot that has a body in MuJoCo."""
 
 
 # ---- the scene --------------------------------------------------------------------------------------------------------------------------
@@ -352,7 +354,7 @@ def _group(kind: Any, rows: np.ndarray) -> _Group:
 
 
 def _scene(groups: Sequence[_Group], dimension: int, obstacles: Sequence[Any]) -> str:
-    """MJCF of a team among obstacles; sets which actuators its robots have."""
+    """MJCF of a team among obstacles. Fills in `_Group.motors`."""
     root = ElementTree.Element("mujoco", model="consat")
     _add(root, "compiler", angle="radian", autolimits="true")
     option = _add(root, "option", gravity=(0, 0, -GRAVITY), integrator="implicitfast", cone="elliptic", impratio=10)
@@ -374,7 +376,7 @@ def _scene(groups: Sequence[_Group], dimension: int, obstacles: Sequence[Any]) -
 
 
 def _shapes(obstacle: Any, dimension: int, number: int, asset: ElementTree.Element) -> Iterator[dict[str, Any]]:
-    """Geoms of an obstacle; those of the plane stand upright."""
+    """Yield the geoms of an obstacle. Obstacles of the plane are extruded."""
     flat = dimension < 3
     if isinstance(obstacle, Disc):
         size = (obstacle.radius, TALL) if flat else obstacle.radius
@@ -396,7 +398,7 @@ def _name(robot: int) -> str:
 
 
 def _add(parent: ElementTree.Element, tag: str, /, **attributes: Any) -> ElementTree.Element:
-    """A new element; attributes are text, numbers or vectors."""
+    """Add an element. Attributes are text, numbers or vectors."""
     told = {
         key: value if isinstance(value, str) else " ".join(f"{float(each):.10g}" for each in np.atleast_1d(value))
         for key, value in attributes.items()
@@ -405,7 +407,7 @@ def _add(parent: ElementTree.Element, tag: str, /, **attributes: Any) -> Element
 
 
 def _in_space(vectors: Any) -> np.ndarray:
-    """(N, d) → (N, 3)."""
+    """(N, d) → (N, 3), padded with 0."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
 
 
@@ -418,7 +420,7 @@ def _across(ahead: np.ndarray) -> np.ndarray:
 
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
-    """(N, 4) → (N, 3, 3)."""
+    """Rotation matrices, (N, 3, 3), of quaternions, (N, 4)."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

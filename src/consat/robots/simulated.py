@@ -1,9 +1,8 @@
-"""Robots whose bodies another program integrates, such as a simulator of rigid bodies.
+"""Robots whose bodies are integrated by another program, such as a simulator of rigid bodies.
 
-What commands move is a reference: the robot's model, stepped exactly, which the safety filter keeps apart from others. The simulator's body
-follows it with a controller of its own. Bodies stay within `tube` of their references, which is a condition of the theorem in
-docs/robots.md; a reference whose body is farther away than half of that halts and waits for it. Positions and headings are those that the
-simulator measures.
+Commands move a reference: the robot's model, stepped exactly. The safety filter keeps references apart. The body in the simulator follows
+its reference with a controller of its own and must stay within `tube` of it, a condition of the theorem in docs/robots.md. If it is farther
+away than half of that, the reference halts and waits. Positions and headings are measured in the simulator.
 """
 
 from __future__ import annotations
@@ -27,23 +26,21 @@ from consat.robots.model import Model, shortened
 from consat.robots.quadrotor import Quadrotor
 
 SIMULATORS: Final = ("mujoco",)
-"""Modules of `consat.robots`, each with a class `Simulator`: a new one is one file, and its name here."""
-
-
+"""Modules of `consat.robots` with a class `Simulator`. To add one, write the module and add its name."""
 WAITS = 0.5
-"""Of its tube: a reference waits for a body that is farther away."""
+"""Fraction of the tube beyond which a reference waits for its body."""
 
 
 class Bodies(NamedTuple):
     """N bodies in a simulator.
 
     Attributes:
-        position: (N, 3) of the body's middle, m.
-        velocity: (N, 3) of it, m/s.
-        heading: (N,) rad.
-        inner: (N, S) all else that the simulator must know to go on.
-        touching: (N, N) pairs (i, j), i < j, that touched in the last step.
-        struck: (N,) who touched an obstacle in the last step.
+        position: (N, 3) centres, m.
+        velocity: (N, 3) velocities of the centres, m/s.
+        heading: (N,) headings, rad.
+        inner: (N, S) further state of the simulator.
+        touching: (N, N) whether robots i < j touched in the last step.
+        struck: (N,) whether a robot touched an obstacle in the last step.
     """
 
     position: Any
@@ -55,32 +52,32 @@ class Bodies(NamedTuple):
 
 
 class Simulator(Protocol):
-    """Integrates the bodies of N robots; made from their model, how many they are, the dimension d and the obstacles.
+    """Integrates the bodies of N robots. Its constructor takes the model, N, the dimension d and the obstacles.
 
-    Its functions take and return NumPy arrays, and what they return depends on their arguments only.
+    Its functions take and return NumPy arrays, and are pure.
     """
 
     @property
     def width(self) -> int:
-        """S: numbers in `Bodies.inner` of each robot."""
+        """Number of columns of `Bodies.inner`, S."""
 
     @property
     def tube(self) -> np.ndarray:
-        """(N,) how far a body may be from its reference, m; see `Simulated.strayed`."""
+        """(N,) largest allowed distance of a body from its reference, m; see `Simulated.strayed`."""
 
     @property
     def acceleration(self) -> np.ndarray:
-        """(N,) at most, at which references set out, m/s²; infinite where their models have limits of their own."""
+        """(N,) largest acceleration of references that set out, m/s²; infinite if the model has a limit of its own."""
 
     def start(self, place: np.ndarray) -> Bodies:
-        """Bodies at rest at (N, d) places of their references, with heading 0."""
+        """Bodies at rest with heading 0, at the places of their references, (N, d)."""
 
     def step(self, bodies: Bodies, before: Any, after: Any, wind: np.ndarray, *, dt: float) -> Bodies:
-        """The bodies after `dt`, in which references went from one state of their models to another; wind: (N, d) velocity of the air."""
+        """The bodies after `dt`. References move from state `before` to `after`; wind: (N, d) velocity of the air, m/s."""
 
 
 class SimulatedState(NamedTuple):
-    """reference: of the model that commands move; bodies: of the simulator."""
+    """reference: state of the reference's model; bodies: state of the simulator."""
 
     reference: Any
     bodies: Bodies
@@ -88,11 +85,11 @@ class SimulatedState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """A robot model whose bodies are in a simulator; made by `simulated`.
+    """A robot model whose bodies are in a simulator; see `simulated`.
 
     Args:
-        name: of the simulator.
-        reference: the model that commands move.
+        name: name of the simulator.
+        reference: model of the references, which commands move.
         simulator: integrates the bodies.
     """
 
@@ -120,7 +117,7 @@ class Simulated:
         return self.reference.place(state.reference)
 
     def position(self, state: SimulatedState) -> Array:
-        """(N, d) the point that constraints see, as the simulator measures it: as far from the body's middle as the reference's."""
+        """(N, d) points that constraints read, measured in the simulator: as far from the body's centre as in the reference."""
         ahead = self.reference.place(state.reference) - self.reference.body(state.reference)
         turn = state.bodies.heading - self.reference.heading(state.reference)
         return self.body(state) + _turned(ahead, turn)
@@ -147,7 +144,7 @@ class Simulated:
         return self.reference.braking(count)
 
     def command(self, state: SimulatedState, velocity: Array, dt: float) -> Array:
-        """As the reference's, but no faster than the body can come to be by then: who sets out does not leave its body behind."""
+        """The command of the reference, no faster than its body can be after `dt`, so that the body is not left behind."""
         body = state.bodies.velocity[:, : velocity.shape[1]]
         pace = jnp.linalg.norm(velocity, axis=1)
         along = jnp.sum(body * velocity, axis=1) / jnp.where(pace > 0.0, pace, 1.0)
@@ -155,7 +152,7 @@ class Simulated:
         return self.reference.command(state.reference, shortened(velocity, limit), dt)
 
     def strayed(self, state: SimulatedState) -> Array:
-        """(N,) how far the body is out of the disc that its model keeps round its reference, m; negative inside."""
+        """(N,) distance of the body from the disc that its model keeps around its reference, m; negative inside."""
         reference, body = state.reference, self.body(state)
         place = self.reference.place(reference)
         return jnp.linalg.norm(body - place, axis=1) - jnp.linalg.norm(self.reference.body(reference) - place, axis=1)
@@ -164,7 +161,7 @@ class Simulated:
         return self.reference.halt(state.reference, dt)
 
     def step(self, state: SimulatedState, command: Array, dt: float, wind: Array | None = None) -> SimulatedState:
-        """The reference moves as its model does, unless its body is left behind; the simulator's body follows. Wind is the body's."""
+        """Move the reference by its model, unless its body is behind; then the body, by the simulator. Wind acts on the body only."""
         before, body = state.reference, self.body(state)
         behind = self.strayed(state) > WAITS * jnp.asarray(self.simulator.tube)
         command = jnp.where(behind[:, None], self.reference.halt(before, dt), command)
@@ -202,17 +199,17 @@ class Simulated:
 
 
 def simulated(name: str, model: Model[Any], count: int, dimension: int, obstacles: Sequence[Any]) -> Simulated:
-    """The model with its bodies in a simulator.
+    """A model with its bodies in a simulator.
 
     Args:
         name: one of `SIMULATORS`.
-        model: what the robots are.
-        count: N.
-        dimension: d.
-        obstacles: the public map.
+        model: model of the robots.
+        count: number of robots, N.
+        dimension: dimension of space, d.
+        obstacles: public map.
 
     Raises:
-        InvalidSettings: there is no such simulator, what it needs is not installed, or it has no body for a kind of robot.
+        InvalidSettings: there is no such simulator, its library is not installed, or it has no body for a kind of robot.
     """
     if name not in SIMULATORS:
         raise InvalidSettings(f"there is no simulator {name!r}{closest(name, SIMULATORS)}; choose {' or '.join(SIMULATORS)}")
@@ -221,19 +218,19 @@ def simulated(name: str, model: Model[Any], count: int, dimension: int, obstacle
 
 
 def kinds_of(model: Model[Any], count: int) -> list[tuple[Any, np.ndarray]]:
-    """The kinds of N robots, and which robots are of each."""
+    """The models of N robots, each with the indices of its robots."""
     return list(zip(model.models, model.members, strict=True)) if isinstance(model, Fleet) else [(model, np.arange(count))]
 
 
 def _reference(model: Model[Any]) -> Model[Any]:
-    """What commands move: of a quadrotor what it follows anyway."""
+    """The model of the reference. A quadrotor follows a double integrator."""
     if isinstance(model, Fleet):
         return Fleet([_reference(kind) for kind in model.models], model.kinds)
     return Double(model.radius, model.speed, model.acceleration) if isinstance(model, Quadrotor) else model
 
 
 def _turned(vectors: Array, angle: Array) -> Array:
-    """(N, d) vectors turned in the plane by (N,) angles."""
+    """Vectors (N, d), turned in the plane by angles (N,)."""
     if vectors.shape[1] == 1:
         return vectors
     cosine, sine = jnp.cos(angle), jnp.sin(angle)

@@ -16,7 +16,7 @@ from jax import Array
 from consat.robots.model import Number, along, checked, each, shortened
 
 NEWTON_STEPS = 6
-"""To find the chord's direction; from the third on they change no digit where l > speed·dt/2."""
+"""Number of iterations for the direction of the chord. With l > speed·dt/2, the third changes no digit any more."""
 
 
 class UnicycleState(NamedTuple):

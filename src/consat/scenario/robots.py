@@ -7,31 +7,34 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import jax.numpy as jnp
 import numpy as np
 
 from consat.errors import Fault, InvalidInput, closest, shown
+from consat.numerics import float64
+from consat.problem.team import Team
 from consat.robots.double import Double
 from consat.robots.fleet import Fleet
 from consat.robots.model import Model
-from consat.robots.obstacles import Obstacle, box, disc, polygon
+from consat.robots.obstacles import Obstacle, box, disc, map_of, polygon
 from consat.robots.point import Point
 from consat.robots.quadrotor import Quadrotor
 from consat.robots.unicycle import Unicycle
 from consat.scenario.mappings import checked
 
 KINDS: Final[Mapping[str, Any]] = {"point": Point, "double": Double, "unicycle": Unicycle, "quadrotor": Quadrotor}
-"""What ``kind:`` may say of robots; the other keys are the arguments of the model."""
+"""The model of each kind of robot. The other keys of a mapping are its arguments."""
 SHAPES: Final[Mapping[str, Any]] = {"disc": disc, "box": box, "polygon": polygon}
-"""What ``kind:`` may say of obstacles."""
+"""The factory of each kind of obstacle."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robots:
-    """The robots of a team, and what stands in their way.
+    """The robots of a team, and the obstacles.
 
     Attributes:
-        common: the robot of every agent that has none of its own.
-        own: those of agents that do, by id.
+        common: the robot of each agent without one of its own.
+        own: robots of single agents, by id.
         obstacles: the public map.
     """
 
@@ -40,7 +43,7 @@ class Robots:
     obstacles: tuple[Obstacle, ...] = ()
 
     def fleet(self, ids: Sequence[str]) -> Model[Any]:
-        """One model for a team: parameters that differ are arrays, kinds that differ make a `Fleet`."""
+        """One model for the team. Parameters that differ are arrays; different kinds make a `Fleet`."""
         each = [self.own.get(agent, self.common) for agent in ids]
         if all(model is each[0] for model in each):
             return each[0]
@@ -50,35 +53,35 @@ class Robots:
 
     @property
     def data(self) -> dict[str, Any]:
-        """As a scenario file has it: ``robots``, ``obstacles``, and ``robot`` by id."""
+        """Plain data as in a scenario file: ``robots``, ``obstacles``, and ``own``, the robots by id."""
         own = {agent: model_data(model) for agent, model in self.own.items()}
         return {"robots": model_data(self.common), "obstacles": [obstacle_data(each) for each in self.obstacles], "own": own}
 
     @property
     def told(self) -> dict[str, Any]:
-        """As ``run --json`` has it: as `data`, with the robots of their own in ``robots.own``, if there are any."""
+        """Plain data as in ``run --json``: like `data`, with ``own`` inside ``robots``."""
         data = self.data
         own = {"own": data["own"]} if data["own"] else {}
         return {"robots": data["robots"] | own, "obstacles": data["obstacles"]}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Robots:
-        """From `data`."""
+        """From plain data, as in `data`."""
         own = {agent: model_of(each) for agent, each in data["own"].items()}
         return cls(model_of(data["robots"]), own, tuple(obstacle_of(each) for each in data["obstacles"]))
 
 
 def asked(robots: Any, obstacles: Any, known: Robots | None, ids: Sequence[str]) -> Robots | None:
-    """The robots of a run: what is given, else what the scenario has.
+    """The robots of a run: those given, else those of the scenario.
 
     Args:
         robots: a model for all, a mapping from ids to models, or the name of a kind; None for those of the scenario.
-        obstacles: what `consat.disc` and its like return; None for those of the scenario.
-        known: of the scenario.
-        ids: of the team.
+        obstacles: obstacles, as `consat.disc` returns; None for those of the scenario.
+        known: robots of the scenario.
+        ids: ids of the team.
 
     Raises:
-        InvalidInput: names what cannot be.
+        InvalidInput: an argument is wrong.
     """
     place = _map(obstacles, known)
     if robots is None and known is None and place:
@@ -109,17 +112,17 @@ def _map(obstacles: Any, known: Robots | None) -> tuple[Obstacle, ...]:
 
 
 def kind_of(model: Model[Any]) -> str:
-    """What a scenario calls a model."""
+    """The name of a model's kind."""
     return next(name for name, kind in KINDS.items() if type(model) is kind)
 
 
 def model_data(model: Model[Any]) -> dict[str, Any]:
-    """A model as a scenario file has it."""
+    """A model as plain data of a scenario file."""
     return {"kind": kind_of(model)} | {each.name: _listed(getattr(model, each.name)) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
 
 
 def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
-    """An obstacle as a scenario file has it."""
+    """An obstacle as plain data of a scenario file."""
     plain = {each.name: getattr(obstacle, each.name) for each in dataclasses.fields(obstacle)}
     return {"kind": type(obstacle).__name__.lower()} | {key: _listed(value) for key, value in plain.items()}
 
@@ -135,11 +138,11 @@ def model_of(data: Any, where: str = "robots", base: Mapping[str, Any] | None = 
 
     Args:
         data: the mapping.
-        where: in words.
-        base: what holds where `data` does not say, if it is of the same kind.
+        where: the mapping in words, for faults.
+        base: mapping with defaults for missing keys, if it has the same kind.
 
     Raises:
-        InvalidInput: names the key, what is wrong with it, and what would be right; paths begin at the mapping.
+        InvalidInput: the mapping has faults. Their paths begin at the mapping.
     """
     return _made(data, KINDS, where, "{kind: unicycle, radius: 0.1}", base)
 
@@ -165,7 +168,32 @@ def _made(data: Any, kinds: Mapping[str, Any], where: str, example: str, base: M
         raise InvalidInput(dataclasses.replace(fault, where=each) for fault, each in zip(error.faults, named, strict=True)) from None
 
 
+@float64
+def blocked_goals(robots: Robots, team: Team) -> list[str]:
+    """Warnings about goals, constraints of the kind ``within``, whose centre is in an obstacle or too close to one, one sentence each.
+
+    Args:
+        robots: robots and obstacles.
+        team: the team. Goals that move are checked at sample times.
+    """
+    size = np.broadcast_to(np.asarray(robots.fleet(list(team.ids)).radius, dtype=float), (team.count,))
+    found: dict[tuple[int, int], str] = {}
+    for instant in team.instants if robots.obstacles else ():
+        for family in (each for each in instant.families if each.kind == "within"):
+            for k, obstacle in enumerate(robots.obstacles):
+                gaps = np.asarray(map_of((obstacle,), team.dimension).signed_distance(jnp.asarray(family.parameters["center"])))
+                for row in np.flatnonzero(gaps < size[family.owner]).tolist():
+                    number, owner = int(family.number[row]), int(family.owner[row])
+                    free = gaps[row] + float(family.parameters["radius"][row]) >= size[owner]
+                    what = "the centre" if free else "no point"
+                    where = f"agent {team.ids[owner]!r}, constraint {team.names[number]!r}"
+                    stand = f"obstacles[{k}] ({type(obstacle).__name__.lower()})"
+                    clear = "is not clear" if free else "is clear"
+                    found[number, k] = f"{where}: {what} of the goal {clear} of {stand} by the radius of the robot"
+    return list(found.values())
+
+
 def _stacked(kind: Any, models: Sequence[Any]) -> Any:
-    """Models of one kind as one, whose parameters are arrays where they differ."""
+    """Join models of one kind. Parameters that differ become arrays."""
     values = {each.name: [getattr(model, each.name) for model in models] for each in dataclasses.fields(kind)}
     return kind(**{name: own[0] if all(value == own[0] for value in own) else np.array(own) for name, own in values.items()})

@@ -1,4 +1,4 @@
-"""The web server: one page and one socket. A client that is slow gets the newest when it is ready for it; nothing is kept for it."""
+"""The web server: one page and one socket. A slow client gets the latest content when it is ready; nothing is queued for it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Watcher(Client):
     """A page that watches over a socket.
 
     Attributes:
-        came: set when there may be something to send.
+        came: event that is set when there may be news to send.
     """
 
     def __init__(self, number: int, simulation: Simulation, loop: asyncio.AbstractEventLoop) -> None:
@@ -40,12 +40,12 @@ class Watcher(Client):
 
 
 class Host:
-    """Shows a simulation to everybody who may see it.
+    """Serves a simulation to the pages that may see it.
 
     Args:
-        simulation: what is shown.
-        token: what the address must end with; None where the loopback is the only way in.
-        hosts: names under which the server is reached; any, where a token is asked for.
+        simulation: the simulation.
+        token: token that the address must end with; None if only this machine can connect.
+        hosts: names of the server that are accepted without a token.
     """
 
     def __init__(self, simulation: Simulation, token: str | None = None, hosts: tuple[str, ...] = LOOPBACK) -> None:
@@ -57,7 +57,7 @@ class Host:
         self.app = Starlette(routes=[Route("/", self.page), WebSocketRoute("/socket", self.socket)])
 
     def notify(self) -> None:
-        """Tell all clients that there is news; from any thread."""
+        """Tell all clients that there is news. May be called from any thread."""
         if self._loop is not None:
             with suppress(RuntimeError):  # the server has ended
                 self._loop.call_soon_threadsafe(self._wake)
@@ -66,10 +66,8 @@ class Host:
         for client in self._clients.values():
             client.came.set()
 
-    # ---- who may come in ----------------------------------------------------------------------------------------------------------------
-
     def _refusal(self, connection: HTTPConnection) -> str | None:
-        """Why somebody may not come in."""
+        """Reason to refuse a connection; None to accept it."""
         host = connection.headers.get("host", "")
         origin = connection.headers.get("origin")
         if origin is not None and urlsplit(origin).netloc != host:
@@ -85,7 +83,7 @@ class Host:
         return None if name in self._hosts else "this server answers to addresses of this machine only"
 
     async def page(self, request: Request) -> Response:
-        """The page."""
+        """Serve the page."""
         if refusal := self._refusal(request):
             return PlainTextResponse(f"{refusal}\n", 403)
         host = request.headers.get("host", "")
@@ -99,7 +97,7 @@ class Host:
         return HTMLResponse(text, headers=headers)
 
     async def socket(self, socket: WebSocket) -> None:
-        """What a page sends and is sent."""
+        """Serve the socket of a page until it closes."""
         refusal = self._refusal(socket)
         if refusal is None and len(self._clients) >= MOST_CLIENTS:
             refusal = f"{MOST_CLIENTS} pages watch already"

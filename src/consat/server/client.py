@@ -1,4 +1,4 @@
-"""One view that watches, however its messages travel: what it asks for, and what it is told."""
+"""One view of the live page, independent of how its messages travel: its orders, its answers, and news."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from consat.server.simulation import Simulation
 MOST_CLIENTS: Final = 16
 MOST_ANSWERS: Final = 64
 RATE, BURST = 200.0, 400.0
-"""Messages a second that a client may send, and how many at once."""
+"""Messages per second that a client may send, and largest burst."""
 
 
 class Allowance:
-    """How much a client may still send: a bucket that fills at a rate.
+    """Token bucket that limits the messages of a client.
 
     Args:
-        rate: messages a second.
-        burst: what it holds.
+        rate: messages per second.
+        burst: most messages at once.
     """
 
     def __init__(self, rate: float = RATE, burst: float = BURST) -> None:
@@ -31,7 +31,7 @@ class Allowance:
         self._left, self._at = burst, time.monotonic()
 
     def take(self) -> bool:
-        """Whether one more is allowed."""
+        """Take one message. Returns whether it is allowed."""
         now = time.monotonic()
         self._left = min(self._burst, self._left + self._rate * (now - self._at))
         self._at = now
@@ -42,15 +42,15 @@ class Allowance:
 
 
 class Client:
-    """One view that watches. It is told the newest; what it was too slow for is lost.
+    """One view. It receives the latest content; a slow view misses what was replaced meanwhile.
 
     Args:
-        number: tells clients apart.
-        simulation: what it watches.
-        wake: called when it has an answer, from any thread.
+        number: number of the client.
+        simulation: the simulation that it watches.
+        wake: called when there is an answer, from any thread.
 
     Attributes:
-        answers: to its orders; of too many the oldest are lost.
+        answers: answers to its orders. If there are too many, the oldest are dropped.
     """
 
     def __init__(self, number: int, simulation: Simulation, wake: Callable[[], None]) -> None:
@@ -60,12 +60,12 @@ class Client:
         self._seen: dict[str, int] = {}
 
     def answer(self, told: dict[str, Any]) -> None:
-        """Answer an order; from any thread."""
+        """Answer an order. May be called from any thread."""
         self.answers.append(json.dumps(told, allow_nan=False))
         self._wake()
 
     def take(self, raw: str | bytes) -> None:
-        """Take what the view sent: an order, or a refusal of it in words."""
+        """Take a message of the view: queue its order, or answer why it is refused."""
         if not self.allowance.take():
             self._refuse(raw, f"more than {RATE:g} messages a second; this one was ignored")
             return
@@ -80,8 +80,8 @@ class Client:
         self.answer({"type": "answer", "id": number_of(raw), "ok": False, "words": words[:1000]})
 
     def news(self) -> Iterator[str | bytes]:
-        """What it has not been told yet."""
-        ready = len(self.answers)  # what they tell of is among the news by now, and is sent first
+        """Yield the content and the answers that the view has not received yet."""
+        ready = len(self.answers)  # the news that they refer to are sent first
         yield from self._simulation.board.news(self._seen)
         for _ in range(min(ready, len(self.answers))):
             yield self.answers.popleft()

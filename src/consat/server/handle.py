@@ -1,4 +1,4 @@
-"""``consat.live``: a session, a server, and a browser that shows it."""
+"""``consat.live``: starts a session, a web server, and a browser that shows it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 NEEDED: Final = ("starlette", "uvicorn", "websockets")
 PORT: Final = 8137
 LARGEST: Final = 65536
-"""Bytes of a message at which a client is shut out; shorter ones that are too long are answered."""
+"""Size of a message that ends a connection, bytes. Shorter messages that are too long are answered."""
 
 
 class Live:
-    """A team that lives on a page.
+    """A live team on a page.
 
     Args:
-        simulation: the team; it is started.
-        host: what `listening` is bound to.
-        listening: where pages connect to.
+        simulation: the team. The constructor starts it.
+        host: address that `listening` is bound to.
+        listening: socket for connections.
 
     Attributes:
-        url: where the page is.
+        url: address of the page.
     """
 
     def __init__(self, simulation: Simulation, host: str, listening: socket.socket) -> None:
@@ -62,11 +62,11 @@ class Live:
 
     @property
     def alive(self) -> bool:
-        """Whether it still goes on."""
+        """Whether server and session go on."""
         return self._thread.is_alive() and self._simulation.alive
 
     def wait(self) -> Self:
-        """Wait until it ends, or until Ctrl-C, which ends it."""
+        """Wait until the session ends. Ctrl-C ends it."""
         try:
             while self.alive:
                 time.sleep(0.2)
@@ -105,23 +105,23 @@ def live(
     team: Team | Scenario | str, *, host: str = "127.0.0.1", port: int | None = None, open_page: bool = True, block: bool | None = None,
     widget: bool | None = None, **settings: Any,
 ) -> Live | LiveWidget:  # fmt: skip
-    """Watch a team, and take hold of it, on a page, or in a notebook as a widget.
+    """Watch a team, and change it, on a page or in a notebook widget.
 
     Args:
         team: a `consat.Team` or a scenario, as in `consat.run`.
-        host: address to listen on. Others than this machine's own ask for the token that `Live.url` ends with.
-        port: to listen on, 0 for a free one; if None, 8137, or a free one where that is taken.
+        host: address to listen on. Pages of other machines need the token at the end of `Live.url`.
+        port: port to listen on; 0 for a free one; None for 8137, or a free one if it is taken.
         open_page: whether to open a browser.
-        block: whether to return only when it ends, with Ctrl-C; by default so in scripts, not where Python is used interactively.
-        widget: whether to return a widget, which listens nowhere; by default so in notebooks, unless a port is given.
-        settings: as of `consat.Session`, such as ``protocol``, ``seed`` and ``loss``.
+        block: whether to return only when the session has ended, with Ctrl-C. None: only in scripts.
+        widget: whether to return a widget, without a server. None: in notebooks, unless a port is given.
+        settings: arguments of `consat.Session`, such as ``protocol``, ``seed`` and ``loss``.
 
     Returns:
         a handle with ``url`` and ``close()``, or the widget, with ``close()``.
 
     Raises:
-        NetworkError: nothing can listen there.
-        InvalidSettings: what it needs is not installed; the message says how to install it.
+        NetworkError: the address cannot be listened on.
+        InvalidSettings: a library is not installed; the message says how to install it.
         ConsatError: as `consat.Session`.
     """
     if port is not None and (not isinstance(port, int) or isinstance(port, bool) or not 0 <= port < 65536):
@@ -145,13 +145,13 @@ def live(
 
 
 def require() -> None:
-    """Raises: InvalidSettings: what the page's server needs is not installed."""
+    """Raises: InvalidSettings: a library for the server is not installed."""
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise InvalidSettings(f"the live page needs {', '.join(missing)}; install them with: pip install 'consat[live]'")
 
 
 def in_notebook() -> bool:
-    """Whether a cell shows what it returns: Jupyter, VS Code and marimo."""
+    """Whether Python runs in a notebook: Jupyter, VS Code or marimo."""
     if "marimo" in sys.modules:
         import marimo
 
@@ -165,7 +165,7 @@ def in_notebook() -> bool:
 
 
 def _bound(host: str, port: int | None) -> socket.socket:
-    """A socket that listens there."""
+    """A socket that listens on an address. Raises: NetworkError: it cannot."""
     found = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     if os.name == "posix":
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,15 +1,15 @@
-"""What a page may ask for: JSON, bounded, checked field by field before anything happens. Nothing of it is ever evaluated."""
+"""Orders of a page: JSON of bounded size. All fields are checked before anything happens; nothing is evaluated."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from consat.errors import InvalidSettings, shown
 
 LONGEST: Final = 4096
-"""Bytes of an order."""
+"""Largest size of an order, bytes."""
 MOST_ROUNDS: Final = 1000
 FASTEST: Final = 1000.0
 
@@ -21,81 +21,72 @@ Place: TypeAlias = Annotated[int, Field(ge=0, lt=2**31)]
 Names: TypeAlias = Annotated[list[Name], Field(max_length=64)]
 Parameters: TypeAlias = Annotated[dict[Name, float | Vector], Field(min_length=1, max_length=8)]
 Described: TypeAlias = Annotated[dict[Name, float | Vector | Text], Field(max_length=12)]
-"""A constraint as a scenario file has it."""
+"""A constraint, as in a scenario file."""
 
 
 class Order(BaseModel):
-    """What all orders have: a number that the answer repeats, and the gesture that it belongs to, which is undone as a whole."""
+    """Base of all orders: a number that the answer repeats, and the gesture that the order belongs to. A gesture is undone as a whole."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     id: Number = None
     gesture: Number = None
 
+    about: ClassVar[tuple[str, ...]] = ()
+    """Fields that say what is set."""
+
     @property
     def subject(self) -> tuple[Any, ...] | None:
         """What the order sets. It replaces earlier orders of the same gesture with the same subject; None if it replaces none."""
-        return None
+        if not self.about:
+            return None
+        values = (getattr(self, name) for name in self.about)
+        keys = (tuple(sorted(value)) if isinstance(value, dict) else value for value in values)
+        return type(self).__name__, *keys, tuple(sorted(self.model_fields_set))
 
 
 class Change(Order):
-    """Other parameters of a constraint."""
+    """Change parameters of a constraint."""
 
+    about = ("agent", "constraint", "parameters")
     do: Literal["change"]
     agent: Name
     constraint: Name
     parameters: Parameters
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The parameters of the constraint."""
-        return "change", self.agent, self.constraint, *sorted(self.parameters)
-
 
 class Shape(Order):
-    """A ball, by its place in the scene, somewhere else or of another size, for all whose it is."""
+    """Move or resize a ball, given by its index in the scene, for all its owners."""
 
+    about = ("scene", "shape")
     do: Literal["shape"]
     scene: Place
     shape: Place
     center: Vector | None = None
     radius: float | None = None
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """Centre or radius, or both, of the ball."""
-        return "shape", self.scene, self.shape, self.center is None, self.radius is None
-
 
 class Wall(Order):
-    """A half-space, by its place in the scene, further along its normal, for all whose it is."""
+    """Move a half-space, given by its index in the scene, along its normal, for all its owners."""
 
+    about = ("scene", "wall")
     do: Literal["wall"]
     scene: Place
     wall: Place
     offset: float
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The offset of the half-space."""
-        return "wall", self.scene, self.wall
-
 
 class Put(Order):
-    """A body somewhere else."""
+    """Move an agent."""
 
+    about = ("agent",)
     do: Literal["place"]
     agent: Name
     position: Vector
 
-    @property
-    def subject(self) -> tuple[Any, ...]:
-        """The position of the agent."""
-        return "place", self.agent
-
 
 class Add(Order):
-    """An agent that joins."""
+    """Add an agent."""
 
     do: Literal["add"]
     agent: Name
@@ -105,14 +96,14 @@ class Add(Order):
 
 
 class OfAgent(Order):
-    """An agent that leaves, falls silent, or comes back."""
+    """Remove, kill or revive an agent."""
 
     do: Literal["remove", "kill", "revive"]
     agent: Name
 
 
 class OfLink(Order):
-    """A link that is cut, or laid."""
+    """Add or remove a link."""
 
     do: Literal["connect", "disconnect"]
     one: Name
@@ -120,7 +111,7 @@ class OfLink(Order):
 
 
 class AddConstraint(Order):
-    """One more constraint."""
+    """Add a constraint."""
 
     do: Literal["add_constraint"]
     agent: Name
@@ -128,7 +119,7 @@ class AddConstraint(Order):
 
 
 class RemoveConstraint(Order):
-    """One constraint less."""
+    """Remove a constraint."""
 
     do: Literal["remove_constraint"]
     agent: Name
@@ -136,35 +127,35 @@ class RemoveConstraint(Order):
 
 
 class Step(Order):
-    """Some rounds, while it pauses."""
+    """Step some rounds while the session is paused."""
 
     do: Literal["step"]
     rounds: Annotated[int, Field(ge=1, le=MOST_ROUNDS)] = 1
 
 
 class Speed(Order):
-    """Rounds a second."""
+    """Set the rounds per second."""
 
     do: Literal["speed"]
     rounds: Annotated[float, Field(gt=0, le=FASTEST)]
 
 
 class Loss(Order):
-    """The share of messages that get lost."""
+    """Set the share of messages that are lost."""
 
     do: Literal["loss"]
     share: Annotated[float, Field(ge=0, lt=1)]
 
 
 class Protocol(Order):
-    """Begin anew with another protocol, from where everybody is."""
+    """Start another protocol from the present positions."""
 
     do: Literal["protocol"]
     kind: Name
 
 
 class Plain(Order):
-    """Orders of one word."""
+    """An order without arguments."""
 
     do: Literal["play", "pause", "undo", "restart", "text"]
 
@@ -177,10 +168,10 @@ _ORDER: Final[TypeAdapter[Any]] = TypeAdapter(Any_)
 
 
 def parse(raw: str | bytes) -> Order:
-    """An order from what a page sent.
+    """Read an order from a message.
 
     Raises:
-        InvalidSettings: says what is wrong with it.
+        InvalidSettings: the message is not an order; says what is wrong.
     """
     content = _content(raw)
     if len(content) > LONGEST:
@@ -199,7 +190,7 @@ class _Numbered(BaseModel):
 
 
 def number_of(raw: str | bytes) -> int | None:
-    """The number of a message that is no order, so that its answer can repeat it; None if it has none."""
+    """The number of a message that is not an order, for its answer; None if it has none."""
     content = _content(raw)
     try:
         return None if len(content) > LONGEST else _Numbered.model_validate_json(content).id
@@ -212,7 +203,7 @@ def _content(raw: str | bytes) -> bytes:
 
 
 def _words(error: ValidationError) -> str:
-    """The first fault."""
+    """The first fault, in words."""
     first = error.errors(include_url=False, include_context=False)[0]
     place = ".".join(str(part) for part in first["loc"][1:] if not isinstance(part, str) or part.isidentifier())
     given = "" if first["type"] in ("missing", "json_invalid") else f"; it is {shown(first['input'])}"

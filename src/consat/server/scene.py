@@ -1,4 +1,4 @@
-"""What stands still of a team, as the page knows it: who there is, links, regions, and the box that holds them."""
+"""The static part of the live page: agents, links, regions, and the box to show."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from consat.views.outlines import MOST, outlines
 from consat.views.shapes import Shapes, moves, shapes
 
 MOST_LISTED: Final = 2000
-"""Constraints that are listed for people to choose from."""
+"""Most constraints that are listed on the page."""
 
 
 class Scene(NamedTuple):
-    """A team as it is drawn.
+    """A team as the page draws it.
 
     Attributes:
-        number: counts scenes; frames say of which they are.
-        team: with its constraints as they stand.
-        shapes: their geometry.
-        balls: of each ball the numbers of its constraints.
-        walls: of each half-space likewise.
-        low: (p,) corner of the box that is shown, p at most 3.
-        high: (p,) its other corner.
+        number: number of the scene, which frames repeat.
+        team: the team, with its present constraints.
+        shapes: geometry of the constraints.
+        balls: for each ball, the indices of its constraints.
+        walls: for each half-space, the indices of its constraints.
+        low: (p,) lower corner of the box to show, p at most 3.
+        high: (p,) upper corner.
     """
 
     number: int
@@ -41,7 +41,7 @@ class Scene(NamedTuple):
 
     @classmethod
     def of(cls, number: int, team: Team, x: np.ndarray, robots: Robots | None = None) -> Scene:
-        """The scene of a team at x (N, d)."""
+        """The scene of a team at positions x, (N, d)."""
         paths = x[None, :, :3]
         stand = None if robots is None or paths.shape[2] < 2 else bodies.bounds(robots.obstacles, paths.shape[2])
         low, high = picture.frame(team, paths, stand=stand)
@@ -50,13 +50,13 @@ class Scene(NamedTuple):
         return cls(number, team, found, *picture.constraints_of(drawn, found), low, high)
 
     def moved(self, team: Team) -> Scene | None:
-        """With half-spaces as they are in `team`; None if no longer the same constraints share them."""
+        """The scene with the half-spaces of `team`; None if other constraints share them now."""
         found = shapes(team)
         balls, walls = picture.constraints_of(team, found)
         return self._replace(team=team, shapes=found) if (balls, walls) == (self.balls, self.walls) else None
 
     def text(self, name: str, robots: Robots | None) -> str:
-        """As JSON."""
+        """The scene as JSON."""
         team, listed = self.team, len(self.team.owner) <= MOST_LISTED
         sizes = None if robots is None else bodies.sizes(robots, team.ids)
         data = {
@@ -78,15 +78,15 @@ class Scene(NamedTuple):
         return json.dumps(data, separators=(",", ":"), allow_nan=False)
 
     def told_balls(self) -> list[dict[str, Any]]:
-        """The balls as the page knows them."""
+        """The balls as plain data."""
         return picture.balls_of(self.team, self.shapes, self.balls)
 
     def told_walls(self) -> list[Mapping[str, Any]]:
-        """The half-spaces as the page knows them."""
+        """The half-spaces as plain data."""
         return picture.walls_of(self.team, self.shapes.walls, self.walls, self.low, self.high)
 
     def traced(self, team: Team, x: np.ndarray) -> str | None:
-        """The boundaries of other ψ, as JSON; None where there are none to trace."""
+        """The boundaries of other ψ as JSON; None if there are none to trace."""
         numbers = self.shapes.others
         if team.dimension != 2 or not 0 < len(numbers) <= MOST:
             return None

@@ -65,7 +65,7 @@ def _targets(team: Team, numbers: list[int]) -> list[Target]:
 
 
 def place_of(team: Team, number: int) -> tuple[Family, int]:
-    """The family of a constraint, and its place in it."""
+    """The family of a constraint, and its row."""
     for family in team.families:
         found = np.flatnonzero(family.number == number)
         if len(found):
@@ -74,7 +74,7 @@ def place_of(team: Team, number: int) -> tuple[Family, int]:
 
 
 def named(team: Team, agent: str, constraint: str) -> list[int]:
-    """The numbers of an agent's constraint of this name, or of the sides of a box; none if there is none."""
+    """Indices of the constraints of an agent with a name, or of the sides of a box; empty if there is none."""
     ids = list(team.ids)
     if agent not in ids:
         return []
@@ -84,7 +84,7 @@ def named(team: Team, agent: str, constraint: str) -> list[int]:
 
 
 def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> dict[str, Any]:
-    """What some parameters of a constraint are now, schedules included, so that they can be put back."""
+    """Present values of some parameters of a constraint, schedules included."""
     found: dict[str, Any] = {}
     for number in numbers:
         family, k = place_of(team, number)

@@ -1,4 +1,4 @@
-"""The view as a widget of a notebook: the page in a frame, its messages over the kernel's comm."""
+"""The live page as a notebook widget: the page in a frame, with messages over the comm of the kernel."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from consat.server.page import page
 from consat.server.simulation import Simulation
 
 MOST_UNTAKEN: Final = 8
-"""Messages on their way to a view; a comm has no limit of its own, and would keep all of a slow one's."""
+"""Most messages on their way to a view. A comm has no limit, and would store all messages for a slow view."""
 PATIENCE: Final = 10.0
-"""Seconds after which a view that takes nothing is taken to be gone. If it was only slow it is told everything anew."""
+"""Time after which a view that takes no message is removed, s. If it was only slow, it is added again and receives everything."""
 
 
 class Watcher(Client):
-    """A view of the widget: one of a cell's output, or of a second output.
+    """A view of the widget. A widget that is shown twice has two.
 
     Attributes:
-        untaken: messages on their way to it.
-        since: when it last took one, s.
+        untaken: number of messages on their way to it.
+        since: time at which it last took one, s.
     """
 
     untaken, since = 0, 0.0
 
 
 class LiveWidget(anywidget.AnyWidget):
-    """A team that lives in a notebook.
+    """A live team in a notebook.
 
-    Each view has a name. It sends ``{view, taken}``, how many messages it took since, to which it adds ``opened``, ``closed``, or
-    ``order``, the order as text. It is sent ``{view, texts}``, of which those that are null stand for the buffers, in order.
+    Each view has a name. It sends ``{view, taken}``, with the number of messages that it took since its last message, and ``opened``,
+    ``closed``, or ``order``, an order as text. It receives ``{view, texts}``; a null among the texts stands for the next buffer.
 
     Args:
-        simulation: the team; it is started.
-        height: of the view, px.
+        simulation: the team. The constructor starts it.
+        height: height of the view, px.
     """
 
     _esm: ClassVar[Any] = resources.files("consat.views").joinpath("widget.js").read_text(encoding="utf-8")
@@ -57,11 +57,11 @@ class LiveWidget(anywidget.AnyWidget):
 
     @property
     def alive(self) -> bool:
-        """Whether it still goes on."""
+        """Whether the session goes on."""
         return self._simulation.alive
 
     def close(self) -> None:
-        """End the session; the view stays as it is at the end."""
+        """End the session. The view stays as it is at the end."""
         self._simulation.close()
 
     def __enter__(self) -> Self:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from consat.errors import InvalidSettings
 from consat.results.result import Result
-from consat.views.scene import Scene, moments
+from consat.views.scene import Scene
 
 MOVEMENT: Final = 0.75
 """Weight of the distance travelled in the time scale of a film; the rest is the clock. Most motion is in the first seconds of a run."""
@@ -83,7 +83,7 @@ def frames(result: Result, count: int, fps: int, progress: Callable[[float], Non
     for artist in scene.moving:
         artist.set_visible(True)
     held = min(count // 10, round(LAST * fps))
-    moving = moments(scene, count - held, MOVEMENT if scene.x.shape[2] > 1 else 0.0, STEP * fps / count)
+    moving = scene.record.moments(count - held, MOVEMENT if scene.x.shape[2] > 1 else 0.0, STEP * fps / count)
     for k, moment in enumerate(np.pad(moving, (0, held), "edge")):
         if k < len(moving):
             scene.show(moment)

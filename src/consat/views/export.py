@@ -1,4 +1,4 @@
-"""A result as a file of another kind; what kind, the ending of its name says."""
+"""Export of a result to other file formats, chosen by the ending of the path."""
 
 from __future__ import annotations
 
@@ -56,19 +56,19 @@ FORMATS: Final[Mapping[str, Callable[[Result, Path, Progress | None], None]]] = 
     ".mcap": _mcap,
     ".mp4": _film,
 }
-"""Endings, and what writes such a file."""
+"""The function that writes each format, by ending."""
 
 
 def save(result: Result, path: str | os.PathLike[str], *, progress: Progress | None = None) -> Path:
-    """Write a result as ``.csv``, ``.gif``, ``.html``, ``.mcap`` or ``.mp4``.
+    """Write a result in one of `FORMATS`.
 
     Args:
-        result: of a run.
-        path: of the file.
-        progress: called with the share that is done, 0 to 1, of a film.
+        result: result of a run.
+        path: path of the file.
+        progress: called with the fraction that is done, 0 to 1, of a film.
 
     Raises:
-        InvalidSettings: another ending, nobody was recorded, or an extra is missing; it says which to install.
+        InvalidSettings: the ending is unknown, no positions were recorded, or an extra is not installed.
     """
     target = Path(path)
     suffix = target.suffix.lower()

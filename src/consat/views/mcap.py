@@ -22,9 +22,10 @@ from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.views import bodies, space
 from consat.views.areas import SHARED, colour_of
 from consat.views.colours import LINK
-from consat.views.figures import colour, period, recorded, seconds, view
+from consat.views.figures import colour, period, view
 from consat.views.outlines import MOST, outlines
 from consat.views.picture import FEW
+from consat.views.record import Record
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
 if TYPE_CHECKING:
@@ -59,12 +60,13 @@ def save(result: Result, path: str | os.PathLike[str]) -> Path:
     except ImportError:
         raise InvalidSettings("an MCAP file needs foxglove-sdk; install it with: pip install 'consat[mcap]'") from None
 
-    target, data, summary = Path(path), recorded(result), result.summary
+    target, record, summary = Path(path), Record(result), result.summary
+    data = record.data
     clock = str(data["position"].dims[0])
-    x = _in_space(np.nan_to_num(data["position"].values))
+    x = _in_space(np.nan_to_num(record.x))
     team = None if "final_position" in result.data else result.team
     steps = data[clock].values.astype(float)
-    times = steps * ROUND if period(result) is None else seconds(result, steps)
+    times = record.times if record.clock == "time" else steps * ROUND
     ids = [str(name) for name in data["agent"].values]
     margins, margin, smooth = (data[name].values for name in ("agent_margin", "margin", "smooth_margin"))
     context = foxglove.Context()
@@ -79,7 +81,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> Path:
         pictures = channels.SceneUpdateChannel("/scene", context=context)
         number = foxglove.Channel("/margin", schema=_schema(["margin", "smooth_margin", "step"]), message_encoding="json", context=context)
         each = foxglove.Channel("/agent_margins", schema=_schema(ids), message_encoding="json", context=context)
-        scene = _Scene(team, ids, x, seconds(result, steps), int(result.data["position"].shape[2]))
+        scene = _Scene(team, ids, x, record.times, int(result.data["position"].shape[2]))
         robots = _Robots(result, data)
         for k, time in enumerate(times):
             stamp = messages.Timestamp(sec=int(time), nsec=round((time - int(time)) * 1e9) % 1_000_000_000)

@@ -1,6 +1,6 @@
-"""Teams, results, sweeps and solutions as notebooks show them: a small table and a figure, as HTML.
+"""HTML of teams, results, sweeps and solutions for notebooks: a small table and a figure.
 
-Colours are those of the notebook's theme, but for the figures, which are white.
+Text has the colours of the notebook's theme. Figures have a white background.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _place(position: Sequence[float | None]) -> str:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]], more: int = 0) -> str:
-    """A table of texts; `more` tells how many rows are left out."""
+    """HTML of a table of texts. more: number of rows that are left out."""
     top = "".join(f'<th style="{CELL}">{escape(name)}</th>' for name in head)
     body = "".join("<tr>" + "".join(f'<td style="{CELL}">{escape(cell)}</td>' for cell in row) + "</tr>" for row in rows)
     left = f"<p>… and {more:,} more</p>" if more else ""
@@ -68,7 +68,7 @@ def _image(figure: Figure | None, alt: str) -> str:
 
 
 def result(found: Result) -> str:
-    """A result: how it ended, the agents, the formation and the margin."""
+    """HTML of a result: outcome, agents, formation and margin."""
     from consat.views import figures
 
     summary = found.summary
@@ -100,7 +100,7 @@ def result(found: Result) -> str:
 
 
 def team(found: Team) -> str:
-    """A team: its agents and their constraints, and where they are to be or, if nothing says, who talks to whom."""
+    """HTML of a team: agents, constraints, and a sketch."""
     shape = [
         counted(found.count, "agent"), counted(len(found.owner), "constraint"), counted(len(found.links), "link"),
         f"dimension {found.dimension}", *([] if found.unit is None else [f"lengths in {found.unit}"]),
@@ -118,9 +118,9 @@ def team(found: Team) -> str:
 
 
 def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
-    """A picture of a team before it runs, or at a formation x (N, d); None of a large one, or where it has not two dimensions.
+    """Picture of a team before a run, or at positions x, (N, d). None for a large team, and for one outside the plane.
 
-    Agents stand where they start, or where they are to be; if that is not known of every one, on a circle, without regions.
+    Agents are at their starts, or at the centres of their goals. If one has neither, all are on a circle, without regions.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
@@ -166,7 +166,7 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
 
 
 def solution(answer: Mapping[str, Any], found: Team | None) -> str:
-    """What `consat.solve` found: the verdict, the best margin, where everybody stands, and what binds."""
+    """HTML of the answer of `consat.solve`: verdict, best margin, positions, and binding constraints."""
     facts = [("best margin", _said(answer["margin"]) + (", proven: none is better" if answer["proven"] else ""))]
     if not answer["proven"] and answer["bounds"][1] is not None:
         facts.append(("none is better than", _said(answer["bounds"][1])))
@@ -187,7 +187,7 @@ def solution(answer: Mapping[str, Any], found: Team | None) -> str:
 
 
 def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
-    """A sweep: a row for each combination of values, and the figure."""
+    """HTML of a sweep: one row for each combination of values, and the figure."""
     from consat.views import spread
 
     groups = summary["groups"]

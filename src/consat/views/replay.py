@@ -1,54 +1,54 @@
-"""A run as one HTML file that replays it offline: nothing is loaded, nothing is evaluated, everything lies inside.
+"""Replay of a run as one HTML file that works offline. The page loads nothing and evaluates nothing.
 
-``replay.html`` is the page, ``page.css`` its look, ``replay.js`` decodes the data and draws; that is built from ``web/``, as the live
-page's script is. The data is JSON; arrays are base64 of little-endian float32.
+The file holds ``replay.html``, the style ``page.css``, the script ``replay.js``, which is built from ``web/``, and the data as JSON. Arrays
+are base64 of little-endian float32.
 """
 
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.colors import to_hex
 
-from consat import __version__
 from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
-from consat.views.figures import period, recorded, seconds
 from consat.views.outlines import MOST, outlines
+from consat.views.page import page as assembled
 from consat.views.picture import FEW, MOST_SHAPES
+from consat.views.record import Record, spread
 from consat.views.shapes import Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
-"""Of a longer record some steps are replayed, evenly spread along what happens."""
+"""Most numbers of a record. Of a longer record, some steps are replayed, spread by movement and time."""
 MOST_OUTLINED: Final = 40
-"""Moments at which the boundaries of moving regions are traced."""
+"""Number of samples at which moving regions are written."""
 SPREAD: Final = 200
+"""Number of moments by which the page paces its time."""
+MOVEMENT: Final = 0.6
+"""Weight of the distance travelled in that pace; the rest is the clock."""
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> Path:
     """Write the page.
 
     Args:
-        result: of a run.
-        path: of the HTML file.
+        result: result of a run.
+        path: path of the HTML file.
 
     Raises:
-        InvalidSettings: nobody was recorded.
+        InvalidSettings: no positions were recorded.
     """
     target = Path(path)
     text = page(result)
@@ -61,20 +61,14 @@ def page(result: Result) -> str:
     """The page as text; see `save`."""
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to replay; run with --record all")
-    files = resources.files("consat.views")
-    style, script, html = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "replay.js", "replay.html"))
     data = json.dumps(document(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     summary = result.summary
     status = summary["status"]
     good = status == "satisfied"
-    policy = f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
     count = summary["count"]
     few = result.data.sizes["agent"] <= FEW
     parts = {
-        "policy": policy,
-        "version": __version__,
         "title": escape(f"{summary['scenario']}: {status}"),
-        "style": style,
         "name": escape(str(summary["scenario"])),
         "tone": "good" if good else "bad",
         "sign": "✓" if good else "✗",
@@ -85,13 +79,8 @@ def page(result: Result) -> str:
         "scale_hidden": "hidden" if few else "",
         "facts": "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in _facts(result)),
         "data": data,
-        "script": script,
     }
-    return re.sub(r"@(\w+)@", lambda found: parts[found[1]], html)
-
-
-def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    return assembled("replay", ("page.css",), parts)[0]
 
 
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
@@ -116,7 +105,7 @@ def _facts(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _scale(result: Result) -> str:
-    """The colours of margins as a picture."""
+    """The colour scale of margins as SVG."""
     palette, edges = _palette(result)
     wide = 100 / len(palette)
     bars = "".join(f'<rect x="{wide * k:.2f}%" y="0" width="{wide:.2f}%" height="14" fill="{shade}"/>' for k, shade in enumerate(palette))
@@ -127,7 +116,7 @@ def _scale(result: Result) -> str:
 
 
 def _palette(result: Result) -> tuple[list[str], list[float]]:
-    """The shades, from below the first edge to above the last, and the edges."""
+    """Colours, from below the first edge to above the last, and the edges."""
     palette, _, edges, _ = classes(result.data["agent_margin"].values[-1])
     inside = [palette(k) for k in range(len(edges) - 1)]
     every: list[Any] = [palette.get_under(), *inside, palette.get_over()]
@@ -140,34 +129,26 @@ def _packed(values: np.ndarray, kind: str = "<f4") -> str:
 
 
 def document(result: Result) -> dict[str, Any]:
-    """What the page knows, as JSON can hold it (schema consat.replay/1).
+    """Data of the page, for JSON (schema consat.replay/1).
 
     ``x`` is (T, N, d) with d at most 3, ``agent_margin`` (T, N), ``margin`` and ``steps`` (T,); ``links`` (L, 2) int32; ``balls``,
-    ``walls`` and ``outlines`` are the regions; ``obstacles`` as a scenario has them, ``bodies`` of robots; ``spread`` are moments, in
-    samples, evenly spread along what happens.
+    ``walls`` and ``outlines`` are the regions; ``obstacles`` as in a scenario; ``bodies`` of robots. ``spread`` are moments, sample indices
+    spread by movement and time.
     """
-    data, summary, team = recorded(result), result.summary, None if "final_position" in result.data else result.team
-    clock = str(data["position"].dims[0])
-    shown = "time" if period(result) is not None else clock
-    x = data["position"].values[:, :, :3]
-    finite = np.flatnonzero(np.isfinite(x).all(axis=(1, 2)))
-    last = int(finite[-1]) if len(finite) else 0
-    chosen = _steps(x[: last + 1])
-    x = x[chosen]
+    record, summary, team = Record(result), result.summary, None if "final_position" in result.data else result.team
+    data, chosen = record.data, _steps(record.x[: record.last + 1, :, :3])
+    x, times, steps = record.x[chosen, :, :3], record.times[chosen], record.steps[chosen]
     dimension = x.shape[2]
-    times = seconds(result, data[clock].values[chosen].astype(float))
     stand = bodies.obstacles(result)
     low, high, found = _regions(team, x, times, bodies.bounds(stand, dimension) if dimension > 1 else None)
-    margin, agent_margin = (data[name].values[chosen] for name in ("margin", "agent_margin"))
-    steps = times if shown == "time" else data[clock].values[chosen]
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
-    since = summary["satisfied_from"]["time" if shown == "time" else "round"]
+    since = summary["satisfied_from"]["time" if record.clock == "time" else "round"]
     return {
         "schema": SCHEMA,
         "name": summary["scenario"],
         "unit": None if team is None else team.unit,
-        "clock": shown,
+        "clock": record.clock,
         "dimension": dimension,
         "ids": [str(name) for name in data["agent"].values],
         "verdict": summary["verdict"],
@@ -176,13 +157,13 @@ def document(result: Result) -> dict[str, Any]:
         "since": since,
         "steps": _packed(steps),
         "x": _packed(np.nan_to_num(x)),
-        "margin": _packed(margin),
-        "agent_margin": _packed(agent_margin),
+        "margin": _packed(record.margin[chosen]),
+        "agent_margin": _packed(record.agent_margin[chosen]),
         "bound": None if bound is None else _packed(bound),
         "links": _packed(team.links if team is not None and len(team.links) <= MOST_SHAPES else np.zeros((0, 2)), "<i4"),
         "low": [round(float(value), 6) for value in low],
         "high": [round(float(value), 6) for value in high],
-        "spread": [round(float(value), 3) for value in _spread(x, steps)],
+        "spread": [round(float(value), 3) for value in spread(x, steps, SPREAD, MOVEMENT)],
         "scale": {"edges": edges, "shades": shades},
         "bodies": _bodies(result, data, chosen),
         "obstacles": [obstacle_data(each) for each in stand],
@@ -191,7 +172,7 @@ def document(result: Result) -> dict[str, Any]:
 
 
 def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | None:
-    """Sizes, and headings (T, N) where there are any; None for points."""
+    """Sizes of bodies, and headings, (T, N), if there are any; None without robots."""
     found = bodies.bodies(result, data)
     if found is None:
         return None
@@ -201,25 +182,17 @@ def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | N
 
 
 def _steps(x: np.ndarray) -> np.ndarray:
-    """Which steps are replayed."""
+    """Indices of the steps that are replayed."""
     most = max(2, MOST_NUMBERS // max(1, x.shape[1] * x.shape[2]))
     if len(x) <= most:
         return np.arange(len(x))
-    return np.unique(np.round(_spread(x, np.arange(len(x)), most)).astype(int))
-
-
-def _spread(x: np.ndarray, steps: np.ndarray, count: int = SPREAD) -> np.ndarray:
-    """(count,) moments from first to last, half by the way travelled, half by the clock."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(np.nan_to_num(x), axis=0), axis=(1, 2))))
-    clock = np.asarray(steps, dtype=float) - float(steps[0])
-    share = 0.6 * way / (way[-1] or 1.0) + 0.4 * clock / (clock[-1] or 1.0)
-    return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))
+    return np.unique(np.round(spread(x, np.arange(len(x)), most, MOVEMENT)).astype(int))
 
 
 def _regions(
     team: Team | None, x: np.ndarray, times: np.ndarray, stand: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
-    """The box to show, low and high, and the regions; `stand`, (B, 2, d), are boxes around obstacles."""
+    """The box to show, lower and upper corner, and the regions. stand: (B, 2, d) boxes around obstacles."""
     low, high = picture.frame(team, x, times, stand)
     if team is None or len(team.owner) > MOST_SHAPES:
         return low, high, {"balls": [], "walls": [], "outlines": []}
@@ -241,7 +214,7 @@ def _regions(
 
 def _moments(x: np.ndarray) -> np.ndarray:
     """Samples at which moving regions are written."""
-    return np.unique(np.round(_spread(x, np.arange(len(x)), MOST_OUTLINED)).astype(int))
+    return np.unique(np.round(spread(x, np.arange(len(x)), MOST_OUTLINED, MOVEMENT)).astype(int))
 
 
 def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
@@ -282,7 +255,7 @@ def _walls(
 def _outlines(
     team: Team, numbers: np.ndarray, x: np.ndarray, times: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[Mapping[str, Any]]:
-    """The boundaries of other ψ in the plane, at some moments where they move."""
+    """Boundaries of other ψ in the plane; of those that move, at some samples."""
     if team.dimension != 2 or not 0 < len(numbers) <= MOST:
         return []
     moving = moves(team)[numbers]

@@ -7,39 +7,35 @@ is drawn as a crowd: agents are dots coloured by margin.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, PathPatch
-from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
 from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views import areas, bodies, space
+from consat.views import areas, bodies, crowd, space
 from consat.views.areas import SHARED, Area, Ground
 from consat.views.colours import AREA, LINK, TRAIL, classes
-from consat.views.figures import GREY, colour, grid, label, marker, period, plain, recorded, regions, seconds, view
+from consat.views.crowd import MOST_LINES, View
+from consat.views.figures import GREY, colour, grid, label, marker, plain, regions, view
+from consat.views.record import Record, between
 from consat.views.shapes import Shapes, boxes, moves, shapes, ways
 from consat.views.words import typeset
 
-MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES, MOST_LINES = 12, 40, 16, 2000
-MOST_SHAPES, MOST_HATCHED, MOST_WALLS, MOST_OTHERS, MOST_TINTED = 20_000, 60, 40, 20, 200
-"""Limits for crowds: constraints for any region to be drawn, hatched keep-outs, walls, other ψ, goal regions drawn with an edge."""
+MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES = 12, 40, 16
+MOST_SHAPES = 20_000
+"""Most constraints of a team whose regions are drawn."""
 GRID = 241
 """Grid points per axis of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
 MOST_MAP = 2.0
 """The view may cut obstacles that are larger than this factor times the extent of the paths."""
-MOST_TIGHTEST, MOST_ASKED = 3, 20
-"""Crowds: how many of the agents with the worst violation have a label, and among how many they are chosen so that labels don't overlap."""
 
 
 def _directions(points: np.ndarray, lengths: Sequence[int]) -> list[np.ndarray]:
@@ -76,20 +72,16 @@ class Scene:
     Attributes:
         axes, figure: where the formation is drawn.
         moving: the artists that `show` changes.
-        x: (T, N, d) positions.
-        steps: (T,) times, s, or round numbers if rounds have no duration.
-        last: index of the last sample at which every position is finite.
+        record: positions and margins.
+        x: (T, N, d) positions, as in `record`.
+        steps: (T,) times, s, or round numbers, as in `record`.
+        last: index of the last finite sample, as in `record`.
     """
 
     def __init__(self, result: Result, axes: Any = None, fine: int = GRID) -> None:
-        data, team = recorded(result), None if "final_position" in result.data else result.team  # regions need the positions of all agents
-        self.x, self._clock = data["position"].values, str(data["position"].dims[0])
-        self.steps, self._margin, self._agent_margin = (data[name].values for name in (self._clock, "margin", "agent_margin"))
-        finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
-        self.last = int(finite[-1]) if len(finite) else 0
-        self._times = seconds(result, self.steps.astype(float))
-        if period(result) is not None:  # rounds have a duration: show seconds
-            self._clock, self.steps = "time", self._times
+        self.record = record = Record(result)
+        data, team = record.data, None if "final_position" in result.data else result.team  # regions need the positions of all agents
+        self.x, self.steps, self.last = record.x, record.steps, record.last
         self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
@@ -108,7 +100,7 @@ class Scene:
         self._crew: bodies.Crew | None = None
         self._robots, self._map = (bodies.bodies(result, data), bodies.obstacles(result)) if seen else (None, ())
         if self._team is not None and (self._space or not self._few):
-            self._shapes = shapes(self._team, self._times[self.last])
+            self._shapes = shapes(self._team, self.record.times[self.last])
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
         rows, letters = self._legend() if self._few else self._crowd_legend(own)
         if own:
@@ -121,12 +113,6 @@ class Scene:
 
     # ---- static parts
 
-    def _trail(self, moment: float) -> np.ndarray:
-        """(K, N, 2 or 3) drawn coordinates of the agents from the start to a moment."""
-        moments = np.append(np.arange(math.ceil(moment), dtype=float), moment)
-        x = _between(self.x, moments)[:, :, : 3 if self._space else 2]
-        return np.concatenate([np.broadcast_to(_between(self.steps, moments)[:, None, None], x.shape), x], axis=2) if self._line else x
-
     def _frame(self, names: Sequence[str], unit: str | None) -> float:
         """Set limits and labels, and draw the map and the static regions. Returns the aspect ratio of the axes, width by height."""
         axes, team, x = self.axes, self._team, self.x[self.last]
@@ -134,18 +120,18 @@ class Scene:
         seen = self._then(self.last) if self._few else None
         paths = self.x[: self.last + 1, :, :axis_count]
         low, high, self._cut = view(paths, x, seen, self._boxes(x, axis_count))
-        self._along, self._points = grid(low, high, 2 if self._space else self._fine)
+        lattice = grid(low, high, 2 if self._space else self._fine)
         labels = [label(f"position {name}", unit) for name in names]
         if self._line:
             until = float(self.steps[self.last]) or 1.0
             low, high = np.array([-0.03 * until, low[0]]), np.array([1.1 * until, high[0]])
-            labels = ["time t [s]" if self._clock == "time" else "round", *labels]
-            self._columns = np.unique(moments(self, 200, 0.5))
+            labels = ["time t [s]" if self.record.clock == "time" else "round", *labels]
+            self._columns = np.unique(self.record.moments(200, 0.5))
         for axis, text, a, b in zip("xyz", labels, low, high, strict=False):
             axes.set(**{f"{axis}lim": (a, b), f"{axis}label": text})
         axes.set_aspect("auto" if self._line else "equal")
-        self._low, self._high = low, high
-        self._unit = (high - low)[:2] if self._line else np.full(2, np.max(high - low))
+        unit_size = (high - low)[:2] if self._line else np.full(2, np.max(high - low))
+        self._view = View(low, high, unit_size, *lattice)
         axes.grid(color="0.92", linewidth=0.8)
         axes.set_axisbelow(True)
         if self._space:
@@ -153,7 +139,7 @@ class Scene:
         (bodies.map_in_space if self._space else bodies.map_in_plane)(axes, self._map)
         if team is not None:
             self._settle(team, x)
-        points = 330.0 * self._trail(self.last)[-1, :, :2] / self._unit
+        points = 330.0 * self.record.trail(self.last)[-1, :, :2] / self._view.unit
         self._where = _directions(points[: len(self._ids)], list(map(len, self._ids))) if self._few else []
         return 1.25 if self._line or self._space else float((high - low)[0] / (high - low)[1])
 
@@ -161,7 +147,7 @@ class Scene:
         """(B, 2, p) boxes that the view must hold besides the regions that `view` finds; None if there are none."""
         if self._team is None:
             return self._near(axes)
-        found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self._times[: self.last + 1])[:, :, :axes]]
+        found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self.record.times[: self.last + 1])[:, :, :axes]]
         if not self._few and self._shapes is not None and not self._line:
             balls = self._shapes.balls
             fixed = balls.around < 0
@@ -180,13 +166,13 @@ class Scene:
     def _settle(self, team: Any, x: np.ndarray) -> None:
         """Prepare the regions. Small team: evaluate ψ and create the artists that `show` updates. Crowd: draw the fixed regions."""
         if self._line and self._few:
-            times = _between(self._times, self._columns)
-            columns = zip(times, _between(self.x, self._columns), strict=True)
-            values = np.stack([regions(team.at(time), at, self._points) for time, at in columns], axis=2)
+            times = between(self.record.times, self._columns)
+            columns = zip(times, between(self.x, self._columns), strict=True)
+            values = np.stack([regions(team.at(time), at, self._view.points) for time, at in columns], axis=2)
             self._areas, self._tube = areas.areas(team, values), values
         elif self._few and not self._space:
             shape = (-1, self._fine, self._fine)
-            values = regions(team.at(self._times[self.last]), x, self._points).reshape(shape).swapaxes(1, 2)
+            values = regions(team.at(self.record.times[self.last]), x, self._view.points).reshape(shape).swapaxes(1, 2)
             self._moves = [family for family in team.families if family.arity > 1 or family.tracks]
             changing = {int(number) for family in self._moves for number in family.number}
             self._still = np.array([number for number in range(len(team.owner)) if number not in changing], dtype=int)
@@ -194,81 +180,28 @@ class Scene:
         elif self._few:
             self._areas = areas.areas(team)
         elif self._shapes is not None and not self._space and not self._line:
-            self._lawn = self._plain(self._shapes, x, self.last)
+            self._lawn = crowd.lawn(self.axes, cast(Team, self._then(self.last)), self._shapes, x, self._view)
         if self._few and not self._space:
-            self._ground = Ground(self.axes, team, self._areas, self._unit)
-
-    def _time(self, moment: float) -> float:
-        """Time of a moment, s."""
-        return float(_between(self._times, moment)[0])
+            self._ground = Ground(self.axes, team, self._areas, self._view.unit)
 
     def _then(self, moment: float) -> Team | None:
         """The team with its constraints at a moment; None if it has none to draw."""
-        return None if self._team is None else self._team.at(self._time(moment))
-
-    def _plain(self, found: Shapes, x: np.ndarray, moment: float) -> list[Artist]:
-        """Draw the regions of a crowd in the plane, except those that move with agents. Returns the new artists."""
-        axes, team, before = self.axes, cast(Team, self._then(moment)), set(self.axes.get_children())
-        center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
-        goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
-        self._kinds = {"goal": len(goals), "bar": len(bars)}
-        look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
-        if len(goals):
-            discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
-            union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
-            axes.add_artist(union)
-        if 0 < len(goals) <= MOST_TINTED:
-            size = 2 * found.balls.radius[goals]
-            ring: dict[str, Any] = {"facecolors": "none", "edgecolors": [(*AREA, 0.55)], "linewidths": 0.7, "gid": "boundary"}
-            axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.7, **ring, **look))
-        if len(bars) > MOST_HATCHED:
-            size = 2 * found.balls.radius[bars]
-            dark: dict[str, Any] = {"facecolors": [(0.3, 0.3, 0.3, 0.35)], "edgecolors": [(0.3, 0.3, 0.3, 0.8)], "linewidths": 0.6}
-            axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.8, gid="keep-out", **dark, **look))
-        for k in bars if len(bars) <= MOST_HATCHED else ():
-            areas.hatched(axes, SHARED).set_path(Path.circle(center[k], found.balls.radius[k]))
-            axes.add_artist(Circle(center[k], found.balls.radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
-        for normal, offset in list(zip(found.walls.normal, found.walls.offset, strict=True))[:MOST_WALLS]:
-            areas.wall(axes, self._low, self._high, normal, offset, SHARED)
-        others = [family for family in team.families if family.arity == 1 and np.isin(family.number, found.others).any()]
-        if 0 < sum(family.size for family in others) <= MOST_OTHERS:
-            values = regions(team, x, self._points, others).reshape(-1, self._fine, self._fine).swapaxes(1, 2)
-            across, up = self._along
-            for number in sorted(int(number) for family in others for number in family.number):
-                for line in areas.contours(across, up, values[number]):
-                    axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))
-        return [artist for artist in axes.get_children() if artist not in before]
+        return None if self._team is None else self._team.at(self.record.time(moment))
 
     def _crowd_legend(self, own: bool) -> tuple[int, int]:
         """Draw the colour bar of the agents' margins, and a legend below. Returns the rows and letters to make room for, as `_legend`."""
-        palette, norm, edges, extend = classes(self._agent_margin[self.last])
+        palette, norm, edges, extend = classes(self.record.agent_margin[self.last])
         self._colours = ScalarMappable(norm, palette)
         place: dict[str, Any] = {"pad": 0.12, "shrink": 0.75} if self._space else {"pad": 0.03}
         place |= {"label": r"agent margin $\barα_i$ (red: violated)", "ticks": edges, "spacing": "uniform", "extend": extend}
         bar = self.figure.colorbar(self._colours, ax=self.axes, **place)
         bar.ax.set_yticklabels([typeset(edge) for edge in edges])
-        line = functools.partial(Line2D, [], [])
-        lines: list[Any] = [line(marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")]
-        if self._robots is not None:
-            lines.clear()  # agents are drawn as bodies, not as dots
-        if self.x.shape[1] <= MOST_LINES:
-            lines.append(line(color=TRAIL, linewidth=2, marker="o", markerfacecolor="white", markersize=4, label="start and path"))
-        if len(self._links):
-            lines.append(line(color=LINK, linewidth=0.9, label="communication link"))
-        if self._space and self._shapes is not None:
-            drawn = [bool(self._shapes.balls.keeps_out[k]) for k in space.chosen(self._shapes)]
-            self._kinds = {"goal": drawn.count(False), "bar": drawn.count(True)}
-            lines.append(line(color=space.FLOOR, marker=".", linestyle=":", label="shadow on the floor"))
-        lines += bodies.legend(self._robots, self._map)
-        kinds = getattr(self, "_kinds", {})
-        if kinds.get("goal"):
-            lines.append(Patch(facecolor=(*AREA, 0.12), edgecolor=(*AREA, 0.7), label="region to be in"))
-        if kinds.get("bar"):
-            lines.append(areas.legend_patch(SHARED, "keep-out"))
-        if own:
-            self.figure.legend(handles=lines, loc="outside lower center", ncols=min(3, len(lines)), frameon=False)
-        else:
-            self.axes.legend(handles=lines, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(3, len(lines)), frameon=False)
+        found = None if self._line else self._shapes
+        agent = Line2D([], [], marker="o", color=palette(0.9), markeredgecolor="0.2", linestyle="", label="agent")
+        lines: list[Any] = [agent] if self._robots is None else bodies.legend(self._robots, self._map)
+        lines += crowd.legend(found, self.x.shape[1], links=len(self._links) > 0, in_space=self._space)
+        where: dict[str, Any] = {"loc": "outside lower center"} if own else {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
+        (self.figure if own else self.axes).legend(handles=lines, ncols=min(3, len(lines)), frameon=False, **where)
         return 0, 8
 
     def _legend(self) -> tuple[int, int]:
@@ -316,7 +249,7 @@ class Scene:
 
     def _cast(self) -> None:
         """Create the artists in the plane; `show` moves them."""
-        trail, axes = self._trail(0.0), self.axes
+        trail, axes = self.record.trail(0.0), self.axes
         ground = [] if self._ground is None else self._ground.artists
         look: dict[str, Any] = {"linewidth": 1.0, "linestyle": DOTS} if self._few else {"linewidth": 0.7}
         self._wires = Line2D([], [], color=LINK, alpha=0.8, zorder=1.5, gid="link", **look)
@@ -331,7 +264,11 @@ class Scene:
             for i, name in enumerate(self._ids):
                 x, y = self._where[i]
                 place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
-                far = 7.0 if self._robots is None else max(7.0, 3 + 330 * (self._robots.radius[i] + self._robots.offset[i]) / self._unit[0])
+                far = (
+                    7.0
+                    if self._robots is None
+                    else max(7.0, 3 + 330 * (self._robots.radius[i] + self._robots.offset[i]) / self._view.unit[0])
+                )
                 self._names.append(axes.annotate(name, trail[0, i], (far * x, far * y), textcoords="offset points", **_ink(i), **place))
             crew = [] if self._crew is None else self._crew.artists
             self.moving = [*ground, self._wires, *self._paths, *starts, *crew, *self._heads, *self._names]
@@ -345,17 +282,17 @@ class Scene:
             self._crew = bodies.Crew(axes, self._robots, None)
             self.moving = [self._paths[0], self._wires, *self._crew.artists]
             return
-        self._dots = axes.scatter(*trail[-1].T, **_dots(count))
+        self._dots = axes.scatter(*trail[-1].T, **crowd.dots(count))
         self.moving = [self._paths[0], self._wires, self._dots]
 
     def show(self, moment: float) -> None:
         """Draw the formation at a moment."""
-        trail, sample = self._trail(moment), int(moment)
+        trail, sample = self.record.trail(moment), int(moment)
         if self._space:
             for artist in self.moving:
                 artist.remove()
-            regions = self._in_space(_between(self.x, moment)[0], moment, moving=True)
-            self.moving = [*regions, *space.shadows(self.axes, trail, float(self._low[2]), paths=self._few)]
+            regions = self._in_space(self.record.where(moment), moment, moving=True)
+            self.moving = [*regions, *space.shadows(self.axes, trail, float(self._view.low[2]), paths=self._few)]
             self.moving += self._agents(trail) if self._few else self._crowd(trail, sample)
             if self._robots is not None and self._few:
                 shades = [colour(i) for i in range(self.x.shape[1])]
@@ -364,10 +301,10 @@ class Scene:
             self.moving += self.axes.plot(*_joined(trail[-1][self._links]), **style)
         else:
             self._move(trail, moment)
-        clock = f"{_between(self.steps, moment)[0]:.1f}".removesuffix(".0")
-        time = f"t = {clock} s" if self._clock == "time" else f"round {self.steps[sample]:.0f}"
+        clock = f"{between(self.steps, moment)[0]:.1f}".removesuffix(".0")
+        time = f"t = {clock} s" if self.record.clock == "time" else f"round {self.steps[sample]:.0f}"
         notes = [*self._sample, *["starts out of view"] * self._cut] + [f"the first two of {self.x.shape[2]} axes"] * (self.x.shape[2] > 3)
-        margin = f", margin {typeset(self._margin[sample])}" if np.isfinite(self._margin[sample]) else ""
+        margin = f", margin {typeset(self.record.margin[sample])}" if np.isfinite(self.record.margin[sample]) else ""
         self.axes.set_title("\n".join([f"{self._name} at {time}{margin}", *(f"({note})" for note in notes)]))
 
     def _move(self, trail: np.ndarray, moment: float) -> None:
@@ -389,27 +326,28 @@ class Scene:
     def _move_ground(self, ground: Ground, moment: float) -> None:
         if self._line:
             seen = np.count_nonzero(self._columns <= moment)
-            ground.show(_between(self.steps, self._columns[:seen]), self._along[0], self._tube[:, :, :seen])
+            ground.show(between(self.steps, self._columns[:seen]), self._view.along[0], self._tube[:, :, :seen])
             return
         if self._moves:
             shape = self._values.shape
-            families = [family.at(self._time(moment)) for family in self._moves]
-            values = regions(cast(Team, self._team), _between(self.x, moment)[0], self._points, families)
+            families = [family.at(self.record.time(moment)) for family in self._moves]
+            values = regions(cast(Team, self._team), self.record.where(moment), self._view.points, families)
             values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
             values[self._still] = self._values[self._still]
             self._values = values
-        across, up = self._along
+        across, up = self._view.along
         ground.show(across, up, self._values)
 
     def _move_crowd(self, trail: np.ndarray, moment: float) -> None:
-        self._paths[0].set_data(*_joined(_thin(trail)))
+        self._paths[0].set_data(*_joined(crowd.thin(trail)))
         if self._lawn and self._team is not None and self._team.moves:
             for artist in self._lawn:
                 artist.remove()
             self.moving = [artist for artist in self.moving if artist not in self._lawn]
-            self._lawn = self._plain(shapes(self._team, self._time(moment)), _between(self.x, moment)[0], moment)
+            found, then = shapes(self._team, self.record.time(moment)), cast(Team, self._then(moment))
+            self._lawn = crowd.lawn(self.axes, then, found, self.record.where(moment), self._view)
             self.moving += self._lawn
-        margins = self._agent_margin[int(moment)]
+        margins = self.record.agent_margin[int(moment)]
         if self._crew is not None:
             self._crew.paint(self._shades(margins))
         else:
@@ -418,15 +356,10 @@ class Scene:
         for name in self._names:
             name.remove()
             self.moving.remove(name)
-        worst: list[int] = []
-        for i in np.argsort(margins)[:MOST_ASKED] if not self._line else ():
-            clear = all(np.any(np.abs(trail[-1, i] - trail[-1, other]) > self._unit * [0.08, 0.03]) for other in worst)
-            if margins[i] <= 0 and clear and len(worst) < MOST_TIGHTEST:
-                worst.append(int(i))
         style: dict[str, Any] = {"fontsize": 8, "path_effects": [withStroke(linewidth=2, foreground="w")], "zorder": 6}
         self._names = [
             self.axes.annotate(self._ids[i], trail[-1, i], (5, 5), textcoords="offset points", clip_on=True, annotation_clip=True, **style)
-            for i in worst
+            for i in ([] if self._line else crowd.worst(margins, trail[-1], self._view.unit))
         ]
         self.moving += self._names
 
@@ -438,14 +371,14 @@ class Scene:
         team = self._then(moment)
         if self._team is None or team is None or self._shapes is None:
             return
-        found, ties = shapes(self._team, self._time(moment)) if self._team.moves else self._shapes, moves(self._team)
+        found, ties = shapes(self._team, self.record.time(moment)) if self._team.moves else self._shapes, moves(self._team)
         chosen = [k for k in space.chosen(found) if bool(found.balls.moves[k]) == moving]
         yield from space.balls(self.axes, found.balls, x, chosen, None if self._few else AREA)
         if not moving:
-            yield from space.walls(self.axes, found.walls, self._low, self._high)
+            yield from space.walls(self.axes, found.walls, self._view.low, self._view.high)
         others = [k for k in found.others.tolist() if ties[k] == moving]
         if self._few and others:
-            yield from space.sections(self.axes, team, others, x, self._low, self._high)
+            yield from space.sections(self.axes, team, others, x, self._view.low, self._view.high)
 
     def _agents(self, trail: np.ndarray) -> Iterator[Artist]:
         """Draw a small team in space."""
@@ -463,8 +396,8 @@ class Scene:
         """Draw a crowd in space, coloured by margin."""
         count = trail.shape[1]
         if count <= MOST_LINES:
-            yield from self.axes.plot(*_joined(_thin(trail)), color=TRAIL, linewidth=0.8, zorder=1, gid="path")
-        yield self.axes.scatter(*trail[-1].T, c=self._shades(self._agent_margin[sample]), depthshade=False, **_dots(count))
+            yield from self.axes.plot(*_joined(crowd.thin(trail)), color=TRAIL, linewidth=0.8, zorder=1, gid="path")
+        yield self.axes.scatter(*trail[-1].T, c=self._shades(self.record.agent_margin[sample]), depthshade=False, **crowd.dots(count))
 
 
 def _path(agent: int) -> dict[str, Any]:
@@ -481,50 +414,11 @@ def _head(agent: int) -> dict[str, Any]:
     return {"color": colour(agent), "marker": marker(agent), "linestyle": "", **look}
 
 
-def _dots(count: int) -> dict[str, Any]:
-    """Marker style of a crowd of `count` agents."""
-    return {"s": 40 if count < 60 else 22 if count < 200 else 9, "edgecolors": "0.2", "linewidths": 0.5, "zorder": 5, "gid": "head"}
-
-
 def _ink(agent: int) -> dict[str, Any]:
     """Text style of an agent's name."""
     return {"color": colour(agent), "weight": "bold", "path_effects": [withStroke(linewidth=2.5, foreground="w")]}
 
 
-def _thin(trail: np.ndarray) -> np.ndarray:
-    """Paths (T, N, p) → (N, K, p), with fewer samples if there are very many; no samples for more than `MOST_LINES` agents."""
-    steps, count = trail.shape[:2]
-    if count > MOST_LINES:
-        return trail[:0].swapaxes(0, 1)
-    return np.concatenate([trail[: -1 : max(1, steps * count // 400_000)], trail[-1:]]).swapaxes(0, 1)
-
-
-def _between(series: np.ndarray, moment: Any) -> np.ndarray:
-    """(K, …) values of a series (T, …) at K moments, interpolated linearly."""
-    moment = np.atleast_1d(moment)
-    share = (moment % 1).reshape(-1, *(1,) * (series.ndim - 1))
-    return (1 - share) * series[moment.astype(int)] + share * series[np.ceil(moment).astype(int)]
-
-
 def _joined(segments: np.ndarray) -> np.ndarray:
     """Lines (S, K, p) → one line (p, S·(K + 1)), separated by NaN, because one artist is much faster than many."""
     return np.concatenate([segments, np.full_like(segments[:, :1], np.nan)], axis=1).reshape(-1, segments.shape[2]).T
-
-
-def moments(scene: Scene, count: int, movement: float, longest: float = 1.0) -> np.ndarray:
-    """Moments from start to end, (count,), spaced by a mean of distance travelled and clock.
-
-    Args:
-        scene: the scene.
-        count: number of moments.
-        movement: weight of the distance, 0 to 1.
-        longest: largest share of the moments within one recorded step, if there are enough steps.
-    """
-    x, clock = scene.x[: scene.last + 1], scene.steps[: scene.last + 1] - float(scene.steps[0])
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.nan_to_num(np.diff(x, axis=0)), axis=(1, 2))))
-    share = movement * way / (way[-1] or 1.0) + (1 - movement) * clock / (clock[-1] or 1.0)
-    steps, longest = np.diff(share), max(longest, 1.2 / max(1, len(share) - 1))
-    while steps.sum() > 0 and steps.max() > 1.01 * longest * steps.sum():
-        steps = np.minimum(steps, longest * steps.sum())
-    share = np.append(0.0, np.cumsum(steps))
-    return np.interp(np.linspace(0.0, share[-1], count), share, np.arange(len(share)))

@@ -49,6 +49,8 @@ def check(name: str, findings: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield f"Assumption {assumption['number']}: {ANSWER[assumption['holds']]}. {escape(assumption['what'])}"
         if assumption["cure"]:
             yield f"  [bold]→[/] {escape(assumption['cure'])}"
+    for warning in findings.get("warnings", ()):
+        yield f"[yellow]warning:[/] {escape(warning)}"
 
 
 def solve(answer: Mapping[str, Any]) -> Iterator[RenderableType]:
