@@ -208,7 +208,7 @@ class Supervisor:
         """Split the team along a spanning tree if it is not satisfied in time along links with loops.
 
         On the tree the agents can prove that they cannot be satisfied. `consat.run` does the same after the same number of rounds, see
-        `consat.engine.rounds.TURN`. Here a new split costs seconds, so the team has at least `WINDOW`. Where messages are lost or late, it
+        `consat.engine.rules.TURN`. Here a new split costs seconds, so the team has at least `WINDOW`. Where messages are lost or late, it
         has proportionally more turns.
         """
         if self._turned is not None or not self._overdue():
