@@ -106,7 +106,7 @@ class Judge:
         held = np.flatnonzero(margin > 0)
         if not len(held):
             return {"share": 0.0, "worst": -np.inf, "lag": np.nan}
-        since = slice(held[0], None)
+        since, most = slice(held[0], None), min(MOST_LATE, ROUNDS - int(held[0]) - 1)
         late = [
             float(np.mean(self.margins(np.roll(positions, -k, axis=0))[since][: ROUNDS - held[0] - MOST_LATE]))
             for k in range(MOST_LATE + 1)
