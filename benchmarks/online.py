@@ -108,8 +108,7 @@ class Judge:
             return {"share": 0.0, "worst": -np.inf, "lag": np.nan}
         since, most = slice(held[0], None), min(MOST_LATE, ROUNDS - int(held[0]) - 1)
         late = [
-            float(np.mean(self.margins(np.roll(positions, -k, axis=0))[since][: ROUNDS - held[0] - MOST_LATE]))
-            for k in range(MOST_LATE + 1)
+            float(np.mean(self.margins(np.roll(positions, -k, axis=0))[since][: ROUNDS - int(held[0]) - most])) for k in range(most + 1)
         ]
         return {"share": float(np.mean(margin[since] > 0)), "worst": float(margin[since].min()), "lag": float(np.argmax(late))}
 
