@@ -16,8 +16,8 @@
                    for each array: its numbers, float64 or float32, row by row
     −4      4      CRC-32 of all before it
 
-Nothing received is ever unpickled or evaluated. There is one way to write a message, and whatever differs is refused. The checksum finds
-accidents, not forgeries: who wrote a message is for the transport to prove (`consat.network.keys`).
+Nothing received is ever unpickled or evaluated. A message has exactly one encoding; anything else is refused. The checksum detects
+accidents, not forgeries: the transport authenticates the sender (`consat.network.keys`).
 """
 
 from __future__ import annotations
@@ -39,31 +39,31 @@ from consat.errors import NetworkError, shown
 
 MAGIC: Final = b"csat"
 VERSION: Final = 4
-"""Since numbers may be of 32 bits, and a message may say that there is nothing new. Others are refused."""
+"""Version of the format; messages of other versions are refused. Version 4 added 32-bit numbers and `Kind.SAME`."""
 LONGEST: Final = 2**22
-"""No message has more bytes."""
+"""Largest size of a message, bytes."""
 MOST_ARRAYS: Final = 32
 LONGEST_NAME: Final = 1024
-"""Bytes of an agent's id."""
+"""Largest size of an agent's id, bytes."""
 AHEAD: Final = 2**20
-"""A sequence number that runs ahead by more is not believed at once."""
+"""Largest step of a sequence number that is accepted at once."""
 QUIET: Final = 1.0
-"""Seconds without an accepted message after which a neighbour's numbers may start anew."""
+"""Time without an accepted message, s, after which a neighbour's sequence numbers may restart."""
 SUPPORT: Final = 3
-"""So many messages on end must agree before they do."""
+"""Number of consecutive consistent messages that are needed for this restart."""
 
 _HEADER: Final = struct.Struct("<4sBBBB8sQQQdddHH")
 _ZERO: Final = 7
-"""Where in the header 0 stands."""
+"""Offset of the zero byte in the header."""
 _SHAPE: Final = struct.Struct("<BII")
 _CHECKSUM: Final = struct.Struct("<I")
 _SINGLE: Final = 4
-"""Added to the dimensions of an array of 32 bits."""
+"""Added to the number of dimensions of a 32-bit array."""
 _TYPES: Final = {False: "<f8", True: "<f4"}
 
 
 class Kind(IntEnum):
-    """What a message is for."""
+    """Kind of a message."""
 
     HELLO = 1
     STATE = 2
@@ -73,7 +73,7 @@ class Kind(IntEnum):
 
 
 class Reason(StrEnum):
-    """Why a message was dropped."""
+    """Reason why a message was dropped."""
 
     SIZE = "size"
     MAGIC = "magic"
@@ -94,20 +94,20 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """What one agent tells a neighbour.
+    """A message from an agent to a neighbour.
 
     Attributes:
-        kind: what it is for.
-        problem: 8 bytes, a hash over public parameters only: agents that solve different problems don't listen to each other.
-        source: who sends it.
-        destination: for whom it is.
-        incarnation: larger after each restart of the sender.
-        sequence: larger in each message of this incarnation to this neighbour, whatever its kind; a repetition is dropped as a duplicate.
-        sent: the sender's clock, in s.
-        echo: `sent` of the last message that the sender got from this neighbour, NaN if none.
-        ack: `sequence` of that message, 0 if none.
+        kind: its kind.
+        problem: hash (8 bytes) of public parameters. Messages of agents that solve other problems are dropped.
+        source: id of the sender.
+        destination: id of the receiver.
+        incarnation: a number that is larger after each restart of the sender.
+        sequence: a number that increases with each message of this incarnation to this neighbour, of any kind.
+        sent: time by the sender's clock, s.
+        echo: `sent` of the last message that the sender received from this neighbour, plus the time since then; NaN without one.
+        ack: `sequence` of that message; 0 without one.
         nu_beta: ν_β that the sender uses.
-        arrays: float64, vectors or matrices. As received they are read-only.
+        arrays: float64 vectors or matrices; read-only in a received message.
     """
 
     kind: Kind
@@ -124,13 +124,13 @@ class Message:
 
 
 class Numbers(NamedTuple):
-    """What an array of a message must be.
+    """Validity conditions of an array of a message.
 
     Attributes:
         shape: (n,) or (rows, columns).
-        largest: no magnitude is above it, or above that of its column. With inf, infinities may stand there; NaN may stand nowhere.
-        sound: whether numbers within these limits, flat, make sense together; None where any do.
-        single: whether they are of 32 bits.
+        largest: largest magnitude, of all or of each column. If it is infinite, infinities are valid. NaN is never valid.
+        sound: function that tells whether the flat numbers are consistent; None if all within the limits are.
+        single: whether the numbers have 32 bits.
     """
 
     shape: tuple[int, ...]
@@ -140,11 +140,11 @@ class Numbers(NamedTuple):
 
 
 Expected = Mapping[Kind, Sequence[Numbers | tuple[int, ...]]]
-"""For each kind, its arrays; a kind that is missing is refused. A plain shape allows all finite numbers."""
+"""For each kind of message its arrays; other kinds are refused. A plain shape allows all finite numbers."""
 
 
 def encode(message: Message, single: Container[int] = ()) -> bytes:
-    """The message as bytes; single: which of its arrays are written in 32 bits."""
+    """The message as bytes. `single`: indices of the arrays that are written in 32 bits."""
     source, destination = _name(message.source), _name(message.destination)
     arrays = [np.ascontiguousarray(array, dtype=_TYPES[k in single]) for k, array in enumerate(message.arrays)]
     if len(message.problem) != 8 or len(arrays) > MOST_ARRAYS:
@@ -168,9 +168,9 @@ def encode(message: Message, single: Container[int] = ()) -> bytes:
 
 
 def claims(payload: bytes, source: str) -> bool:
-    """Whether the message says that it is from `source`. Nothing else of it is looked at.
+    """Whether the sender field of a message names `source`; nothing else is checked.
 
-    A transport that knows who wrote a message asks this, so that no neighbour can speak in another's name.
+    A transport that has authenticated the sender uses this, so that no neighbour can send in another's name.
     """
     name = _name(source)
     at = _HEADER.size
@@ -178,18 +178,18 @@ def claims(payload: bytes, source: str) -> bool:
 
 
 class Checker:
-    """Stands at the door of one agent: hands on what is well-formed, for it, from a neighbour, of this problem, and new; counts the rest.
+    """Accepts the messages to an agent that are well-formed, from a neighbour, of the same problem, and new. Counts the others by reason.
 
-    Its memory is bounded by the number of neighbours, whatever arrives. Of a neighbour it remembers the newest (incarnation, sequence) and
-    refuses older ones. A forged huge number must not mute the neighbour for good: a sequence that runs far ahead is not believed, and when
-    for `quiet` seconds nothing was accepted from the neighbour, `SUPPORT` messages on end that agree on where they are start it anew.
+    Its memory is bounded by the number of neighbours: it keeps the newest (incarnation, sequence) of each, and refuses older ones.
+    A forged huge number must not block a neighbour for good: a step of more than `AHEAD` is refused; but after `quiet` seconds without an
+    accepted message, `SUPPORT` consecutive messages with consistent numbers restart the sequence.
 
     Args:
-        me: this agent.
-        neighbours: for each neighbour, what to expect from it.
+        me: id of the agent.
+        neighbours: for each neighbour the expected arrays.
         problem: see `Message`.
-        quiet: longer than the network holds messages back.
-        clock: in s.
+        quiet: time, s, longer than the longest delay of messages.
+        clock: clock, s.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class Checker:
         self._longest = _HEADER.size + len(self._me) + max(each, default=0) + _CHECKSUM.size
 
     def accept(self, payload: bytes) -> Message | None:
-        """The message, or None if it is to be dropped."""
+        """The decoded message; None if it is dropped."""
         found = self._check(payload)
         if isinstance(found, Reason):
             self.counts[found] += 1
@@ -222,7 +222,7 @@ class Checker:
         return found
 
     def _broken(self, payload: bytes) -> Reason | None:
-        """What tells, without a look inside, that this is no message that anybody could have sent here."""
+        """Reason why the bytes are not a message for this agent, from size, header and checksum; None if there is none."""
         size = len(payload)
         if not _HEADER.size + _CHECKSUM.size <= size <= self._longest:
             return Reason.SIZE
@@ -267,17 +267,17 @@ class Checker:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How the arrays of one kind of message lie in it.
+    """Layout of the arrays in a message of one kind.
 
     Attributes:
-        count: of arrays.
-        shapes: the bytes that tell them.
-        slices: of each array, where its numbers begin and end among all, and its shape.
-        single: which arrays are of 32 bits.
-        numbers: how many, in all arrays.
-        largest: the largest magnitude of each number, or of all.
-        sound: of arrays that are to make sense, where their numbers begin and end, and what tells.
-        bytes: of shapes and numbers.
+        count: number of arrays.
+        shapes: encoded shapes.
+        slices: for each array the begin and end of its numbers among all, and its shape.
+        single: indices of the 32-bit arrays.
+        numbers: total count of numbers.
+        largest: largest magnitude of each number, or of all.
+        sound: for each array with a check of consistency the begin and end of its numbers, and the check.
+        bytes: size of shapes and numbers.
     """
 
     count: int
@@ -308,19 +308,19 @@ class _Layout:
         return cls(len(each), shapes, slices, single, sum(sizes), largest, sound, total)
 
     def read(self, payload: memoryview, at: int) -> np.ndarray:
-        """All numbers, from where they begin; a copy, aligned."""
+        """All numbers as an aligned copy. `at`: offset of the first."""
         if not self.single:
             return np.frombuffer(payload, _TYPES[False], self.numbers, at).astype(float)
         parts = [np.zeros(0)]
         for k, (begin, end, _) in enumerate(self.slices):
             part = np.frombuffer(payload, _TYPES[k in self.single], end - begin, at)
-            with np.errstate(invalid="ignore"):  # of signalling NaN, which is refused like any other
+            with np.errstate(invalid="ignore"):  # a signalling NaN is refused later, as any NaN
                 parts.append(part.astype(float))
             at += part.nbytes
         return np.concatenate(parts)
 
     def wrong(self, numbers: np.ndarray) -> Reason | None:
-        """What is, with the numbers of a message."""
+        """Reason why numbers are refused; None if they are valid."""
         if not (np.abs(numbers) <= self.largest).all():
             return Reason.NUMBER
         return None if all(sound(numbers[begin:end]) for begin, end, sound in self.sound) else Reason.SENSE
@@ -331,7 +331,7 @@ class _Layout:
 
 
 class _Window:
-    """The newest numbers of a neighbour, and those of a rival that may replace them."""
+    """The newest (incarnation, sequence) of a neighbour, and a candidate that may replace it."""
 
     __slots__ = ("_heard", "_newest", "_rival", "_support")
 
@@ -342,7 +342,7 @@ class _Window:
         self._support = 0
 
     def refuse(self, incarnation: int, sequence: int, now: float, quiet: float) -> Reason | None:
-        """Why not to take it; None takes it."""
+        """Reason why a message is refused; None if it is accepted."""
         if (newest := self._newest) is None:
             self._take(incarnation, sequence, now)
             return None

@@ -102,8 +102,8 @@ class FixedRate:
             self._regrouped = self._count
         self._state = station.check_restarts(self._state)
         inbox, arrived = station.core.empty()
-        for neighbour, told in self._latest.items():
-            station.deliver(neighbour, told, inbox, arrived)
+        for neighbour, arrays in self._latest.items():
+            station.deliver(neighbour, arrays, inbox, arrived)
         self._latest.clear()
         moment = Moment(
             float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place(),

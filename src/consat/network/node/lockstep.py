@@ -121,7 +121,7 @@ class Lockstep:
                 before = self._blocks[message.source].get(reached - 1)
                 if before is not None and reached <= self._round:  # else the neighbour will be asked for the whole message
                     self._reached[message.source] = reached
-                    self._take(message.source, reached, self.station.same(before), before)
+                    self._take(message.source, reached, self.station.unchanged(before), before)
 
     def _take(self, neighbour: str, reached: int, current: Sequence[np.ndarray], previous: Sequence[np.ndarray]) -> None:
         """Store a neighbour's messages of round `reached` and of the round before it."""
@@ -166,14 +166,14 @@ class Lockstep:
                 station.deliver(neighbour, block, inbox, arrived)
         moment = self._moment(self._round - self._regrouped)
         self._state, outbox, view = station.turn(self._state, inbox, arrived, moment)
-        outbox, told = station.filter(outbox)
+        outbox, receivers = station.filter(outbox)
         self._outbox = outbox, outbox if self._outbox is None else self._outbox[0]
         self._round += 1
         self._usual = min(now - self._began, 1.05 * self._usual, SELDOM)
         self._patience = max(RESEND, min(USUAL * self._usual, SELDOM))
         self._began = now
         self._save()
-        self._send(now, told)
+        self._send(now, receivers)
         station.move(view, float(self._round))
         if self._over():
             station.log("finished", round=self._round)
@@ -191,7 +191,7 @@ class Lockstep:
         assert self._outbox is not None
         current, previous = (station.blocks(outbox) for outbox in self._outbox)
         number = np.array([self._round - 1.0])
-        self._message = {neighbour: [*told, *previous[neighbour], number] for neighbour, told in current.items()}
+        self._message = {neighbour: [*arrays, *previous[neighbour], number] for neighbour, arrays in current.items()}
         self._lacking.clear()
         self._sent_at = now
         station.send(self._message, among=among)

@@ -53,19 +53,19 @@ class Order(NamedTuple):
     line: str
 
 
-def order_of(told: Any, line: str) -> Order | str:
+def order_of(value: Any, line: str) -> Order | str:
     """Parse a JSON value as an order. Returns the order, or the reason why it is not one.
 
     Args:
-        told: the JSON value.
+        value: the JSON value.
         line: its line on stdin.
     """
-    command = told.get("command") if isinstance(told, dict) else None
+    command = value.get("command") if isinstance(value, dict) else None
     if not isinstance(command, str):
         return f"it must be {EXAMPLE}"
     if command not in KEYS:
         return f"there is no command {shown(command)}{closest(command, KEYS)}; the commands are {', '.join(KEYS)}"
-    given = {key: value for key, value in told.items() if key != "command"}
+    given = {key: each for key, each in value.items() if key != "command"}
     for key in KEYS[command]:
         if key not in given:
             return f"{command} lacks {key}"
@@ -121,12 +121,12 @@ class Orders:
     def _take(self, line: str) -> str | None:
         """Process a line. Returns the reason if it is rejected, else None."""
         try:
-            told = json.loads(line)
+            value = json.loads(line)
         except (ValueError, RecursionError):
             return "it is no JSON"
-        if isinstance(told, dict) and "position" in told and "command" not in told:
-            return self._measure(line, told["position"], told.get("stamp"), told)
-        order = order_of(told, line[:SHOWN])
+        if isinstance(value, dict) and "position" in value and "command" not in value:
+            return self._measure(line, value["position"], value.get("stamp"), value)
+        order = order_of(value, line[:SHOWN])
         if isinstance(order, str):
             return order
         if order.command == "stop":

@@ -312,7 +312,7 @@ class Station:
         if self._filter is not None:
             self._filter.resume(rows, np.asarray(state.bodies.position))
 
-    def same(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def unchanged(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The message that a neighbour without news would have sent. `arrays`: the arrays of its previous message."""
         block = arrays[0].copy()
         for column in self.core.ages:
