@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from consat.errors import Fault, InvalidTeam, shown
+from consat.problem import graphs
 from consat.problem.agent import Agent
 from consat.problem.changes import named, place_of
 from consat.problem.constraints.record import flatten
-from consat.problem.graphs import require_connected
+from consat.problem.parameters import Path
 from consat.problem.team import Team
 
 
@@ -49,24 +50,32 @@ def without_agent(team: Team, agent: str) -> Team:
     if team.count == 1:
         raise InvalidTeam([Fault((), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
     new, _ = team.part(np.delete(np.arange(team.count), i))
-    connected(new, f"without agent {agent!r}")
+    require_connected(new, f"without agent {agent!r}")
     return new
 
 
-def with_link(team: Team, one: str, other: str) -> Team:
-    """The team with one more link. Raises: InvalidTeam: there are no such agents, or they are linked already."""
+def with_link(team: Team, one: str, other: str, path: Path = ()) -> Team:
+    """The team with one more link. `path`: place of the change in the input, for faults.
+
+    Raises:
+        InvalidTeam: there are no such agents, or they are linked already.
+    """
     pair, there = _link(team, one, other)
     if there.any():
-        raise InvalidTeam([Fault((), "they are linked already", f"link [{one}, {other}]")])
+        raise InvalidTeam([Fault(path, "they are linked already", f"link [{one}, {other}]")])
     links = np.concatenate([team.links, np.array([pair], dtype=np.int32)])
     return team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))])
 
 
-def without_link(team: Team, one: str, other: str) -> Team:
-    """The team without a link; agents that depend on each other may not be connected in it. Raises: InvalidTeam: there is no such link."""
+def without_link(team: Team, one: str, other: str, path: Path = ()) -> Team:
+    """The team without a link; agents that depend on each other may not be connected in it. `path`: place of the change in the input.
+
+    Raises:
+        InvalidTeam: there are no such agents, or there is no such link.
+    """
     _, there = _link(team, one, other)
     if not there.any():
-        raise InvalidTeam([Fault((), "there is no such link", f"link [{one}, {other}]")])
+        raise InvalidTeam([Fault(path, "there is no such link", f"link [{one}, {other}]")])
     return team.with_links(team.links[~there])
 
 
@@ -85,12 +94,18 @@ def without_constraint(team: Team, agent: str, constraint: str) -> Team:
     return _like(team, agents)
 
 
-def connected(team: Team, where: str) -> None:
-    """Raises: InvalidTeam: agents that depend on each other are not connected by links. `where`: the change that led to this team."""
+def require_connected(team: Team, where: str, path: Path = ()) -> None:
+    """Raises: InvalidTeam: agents that depend on each other are not connected by links.
+
+    Args:
+        team: the team.
+        where: the change that led to it, for the message.
+        path: place of the change in the input.
+    """
     try:
-        require_connected(team)
+        graphs.require_connected(team)
     except InvalidTeam as error:
-        raise InvalidTeam([dataclasses.replace(fault, where=where) for fault in error.faults]) from None
+        raise InvalidTeam([dataclasses.replace(fault, path=path, where=where) for fault in error.faults]) from None
 
 
 def _link(team: Team, one: str, other: str) -> tuple[tuple[int, int], np.ndarray]:

@@ -334,7 +334,7 @@ class Session:
             InvalidTeam: no such link, or agents that depend on each other would not be connected without it; the session is unchanged.
         """
         new = structure.without_link(self.team, one, other)
-        structure.connected(new, f"without the link [{one}, {other}]")
+        structure.require_connected(new, f"without the link [{one}, {other}]")
         self._restructure(new)
         return self
 
@@ -375,7 +375,7 @@ class Session:
         """
         if team.dimension != self.dimension:
             raise InvalidTeam([Fault(("dimension",), f"dimension is {team.dimension}, but must stay {self.dimension}", "dimension")])
-        structure.connected(team, "the team")
+        structure.require_connected(team, "the team")
         self._restructure(team)
         return self
 

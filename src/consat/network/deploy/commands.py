@@ -15,8 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from consat.errors import AT_KEY, Fault, InvalidTeam, Place, closest, shown
-from consat.problem.changes import adjusted, changed, changes_of, is_adjustment, place_of
-from consat.problem.graphs import require_connected
+from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
+from consat.problem.structure import require_connected, with_link, without_link
 from consat.problem.team import Team
 from consat.scenario.document import Document, Node, decode, read
 
@@ -219,26 +219,14 @@ def _after(stage: Stage, entry: Mapping[str, Any]) -> Timed:
         present = present - {agent} if command == "leave" else present | {agent}
         if not present:
             raise InvalidTeam([Fault(("agent",), "it is the last agent; a team needs at least one", f"agent {agent!r}")])
-        _require_connected(Stage(at, team, present), "agent", f"{'without' if command == 'leave' else 'with'} agent {agent!r}")
+        where = f"{'without' if command == 'leave' else 'with'} agent {agent!r}"
+        require_connected(Stage(at, team, present).present_team()[0], where, ("agent",))
     return Timed(at, command, (agent,), entry.get("constraint", ""), given, Stage(at, team, present))
 
 
 def _relinked(stage: Stage, command: str, agents: tuple[str, ...]) -> Team:
-    team, where = stage.team, f"link [{', '.join(agents)}]"
-    pair = sorted(place_of(team, agent) for agent in agents)
-    there = (team.links == np.array(pair)).all(axis=1)
-    if bool(there.any()) == (command == "connect"):
-        message = "they are linked already" if command == "connect" else "there is no such link"
-        raise InvalidTeam([Fault(("agents",), message, where)])
-    links = np.concatenate([team.links, np.array([pair], dtype=np.int32)]) if command == "connect" else team.links[~there]
-    new = team.with_links(links[np.lexsort((links[:, 1], links[:, 0]))])
-    _require_connected(stage._replace(team=new), "agents", f"without the {where}")
+    change = with_link if command == "connect" else without_link
+    one, other = agents
+    new = change(stage.team, one, other, ("agents",))
+    require_connected(stage._replace(team=new).present_team()[0], f"without the link [{one}, {other}]", ("agents",))
     return new
-
-
-def _require_connected(stage: Stage, key: str, where: str) -> None:
-    """Raises: InvalidTeam: a cluster of the present agents would not be connected by links."""
-    try:
-        require_connected(stage.present_team()[0])
-    except InvalidTeam as error:
-        raise InvalidTeam([replace(fault, path=(key,), where=where) for fault in error.faults]) from None
