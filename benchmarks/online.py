@@ -258,6 +258,7 @@ def main() -> None:
                 f"drift {drift:.2%} {name}: {np.mean(shares):.2%} of the rounds, worst team {min(shares):.2%}, {time.perf_counter() - began:.0f} s",
                 flush=True,
             )
+        jax.clear_caches()  # the programs of sixty teams would fill the memory
     rows = [
         [f"{drift:.2%}", name, f"{np.mean([e['share'] for e in each]):.2%}", f"{min(e['share'] for e in each):.2%}",
          f"{np.median([e['worst'] for e in each]):.2f}", f"{np.nanmedian([e['lag'] for e in each]):.0f}"]
