@@ -85,11 +85,6 @@ class Supervisor:
         """Duration of a round, s; 1 if nothing depends on time."""
         return 1.0 / (self.plan.rate or ROUNDS_A_SECOND) if self.timed else 1.0
 
-    @staticmethod
-    def _stamp(unix: float) -> float:
-        """The stamp of a Unix time: the time on the monotonic clock of this machine, s."""
-        return unix - time.time() + time.monotonic()
-
     @property
     def earliest(self) -> float:
         """The first stamp at which the team may be done: after the last command and the last motion of constraints. ∞ while not known."""
@@ -102,7 +97,7 @@ class Supervisor:
         last = max([moving, *(each.at for each in self._script.commands)])
         if self.plan.mode == "lockstep":
             return last / self.tick
-        return np.inf if self.epoch is None else self._stamp(self.epoch) + last
+        return np.inf if self.epoch is None else self.epoch - time.time() + time.monotonic() + last
 
     def start(self, agent: str) -> None:
         """Start or restart an agent, with its body at its last reported position. In lockstep it resumes from its state on disk."""

@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -159,17 +159,6 @@ class Core(Protocol):
     def without_proofs(self, state: Any) -> Any:
         """The state without proofs, which become invalid when constraints change."""
         ...
-
-
-_Any = TypeVar("_Any", bound=Any)
-
-
-def adjusted(core: _Any, whole: Part) -> _Any:
-    """Copy of a core with other constraint parameters. Nothing is compiled. `whole`: a part that differs only in these parameters."""
-    other = copy.copy(core)
-    other.whole, other.part = whole, whole.without(set(core.whole.team.ids) - set(core.part.team.ids))
-    other.solver = replace(core.solver, live=live_of(other.part))
-    return other
 
 
 class IndexMap(NamedTuple):
@@ -409,8 +398,11 @@ class Embodied:
         return Embodied(self.core.without(gone, whole))
 
     def adjusted(self, whole: Part) -> Embodied:
-        """See `adjusted`."""
-        return Embodied(adjusted(self.core, whole))
+        """Copy with other constraint parameters. Nothing is compiled. `whole`: a part that differs only in these parameters."""
+        core: Any = copy.copy(self.core)
+        core.whole, core.part = whole, whole.without(set(core.whole.team.ids) - set(self.part.team.ids))
+        core.solver = replace(core.solver, live=live_of(core.part))
+        return Embodied(core)
 
     def without_proofs(self, state: EmbodiedState) -> EmbodiedState:
         """See `Core.without_proofs`."""

@@ -185,7 +185,7 @@ def runner_of(
     lockstep = settings.mode == "lockstep"
     station = Station(
         part, core or core_of(part, settings), settings.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
-        frames=2 if lockstep else 1, stamped=lockstep, beat=settings.beat, give_up=settings.give_up, report=settings.report, wall=wall,
+        lockstep=lockstep, beat=settings.beat, give_up=settings.give_up, report=settings.report, wall=wall,
     )  # fmt: skip
     if lockstep:
         return Lockstep(station, turns=settings.turns, rate=settings.rate, memory=settings.memory)

@@ -19,7 +19,7 @@ from consat.network.node.neighbours import Peers
 from consat.network.node.news import NewsFilter
 from consat.network.node.pair_core import PairCore
 from consat.network.node.pairs import MessageLayout, halves, whole
-from consat.network.node.part import Part
+from consat.network.node.part import Neighbour, Part
 from consat.network.transports import Transport
 from consat.network.wire import VERSION, Expected, Kind, Message, Numbers, Reason
 from consat.numerics import float64, number
@@ -48,8 +48,7 @@ class Station:
         incarnation: a number that is larger after each restart of the agent.
         body: sensor and actuator.
         log: function that takes events (JSON-serialisable data).
-        frames: number of rounds in a message.
-        stamped: whether a message contains the number of its round.
+        lockstep: whether a message contains two rounds, and the number of the newer one.
         beat: number of silent steps after which an agent that sends only news repeats itself; None if it sends everything.
         give_up: silence of a neighbour, s, after which it counts as having left for good.
         report: time between two reports, s; 0 reports after each step.
@@ -67,8 +66,7 @@ class Station:
         incarnation: int,
         body: Body,
         log: Log,
-        frames: int = 1,
-        stamped: bool = False,
+        lockstep: bool = False,
         beat: float | None = None,
         give_up: float = np.inf,
         report: float = REPORT,
@@ -82,17 +80,7 @@ class Station:
         self.peers = Peers(
             part,
             part.problem(mode, "all" if beat is None else "events"),
-            {
-                neighbour.id: _expected(
-                    len(neighbour.shares),
-                    core.largest,
-                    self._halves.get(neighbour.id) or (core.pair_numbers[neighbour.id],),
-                    frames,
-                    stamped,
-                    same=stamped and beat is not None,
-                )
-                for neighbour in part.neighbours
-            },
+            {neighbour.id: self._expected(neighbour, lockstep=lockstep) for neighbour in part.neighbours},
             transport,
             clock,
             incarnation,
@@ -116,6 +104,15 @@ class Station:
     def _new_filter(self) -> NewsFilter | None:
         """The filter of messages for the present core; None if everything is sent."""
         return None if self._beat is None else NewsFilter(self.core, self._beat)
+
+    def _expected(self, neighbour: Neighbour, *, lockstep: bool) -> Expected:
+        """Expected arrays of a neighbour's messages. The last entry of each row of a link is a membership number."""
+        shares, largest = len(neighbour.shares), self.core.largest
+        pair = self._halves.get(neighbour.id) or (self.core.pair_numbers[neighbour.id],)
+        frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *pair]
+        state = [*frame, *frame, Numbers((1,))] if lockstep else frame
+        found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {Kind.HELLO: [(shares,)], Kind.STATE: state, Kind.GOODBYE: []}
+        return found | ({Kind.SAME: [(1,)]} if lockstep and self._beat is not None else {})
 
     # -- membership --------------------------------------------------------------------------------------------------------------------
 
@@ -487,28 +484,6 @@ class Station:
             dropped=self.peers.dropped,
         )
         self._track = []
-
-
-def _expected(
-    shares: int, largest: np.ndarray, pair: Sequence[Numbers], frames: int, stamped: bool, *, same: bool
-) -> Expected:  # fmt: skip
-    """Expected arrays of a neighbour's messages.
-
-    Args:
-        shares: number of positions that both hold.
-        largest: (width,) largest magnitudes in a row; a membership number follows.
-        pair: formats of the row for the neighbour.
-        frames: see `Station`.
-        stamped: see `Station`.
-        same: whether the neighbour may send that a round brought no news.
-    """
-    frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *pair]
-    found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {
-        Kind.HELLO: [(shares,)],
-        Kind.STATE: [*frame * frames, *[(1,)] * stamped],
-        Kind.GOODBYE: [],
-    }
-    return found | ({Kind.SAME: [(1,)]} if same else {})
 
 
 def _half_numbers_of(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
