@@ -141,6 +141,8 @@ def test_goals_in_obstacles_are_named() -> None:
         "agent 'c', constraint 'later': no point of the goal is clear of obstacles[0] (disc) by the radius of the robot",
     ]
     assert blocked_goals(Robots(cs.Point(radius=0.1)), cs.Team(goals)) == []
+    found = cs.run(cs.Team(goals), robots=robots.common, obstacles=robots.obstacles, rate=10, until=0.5).summary["warnings"]
+    assert set(blocked_goals(robots, cs.Team(goals))) <= set(found)
 
 
 def test_obstacles_without_robots_are_a_fault() -> None:

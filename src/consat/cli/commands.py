@@ -210,9 +210,6 @@ def run(
     loaded = None if scenario is None else _load(scenario, overrides)
     from consat.runs import runner
 
-    if loaded is not None and not (quiet or as_json):
-        for warning in _blocked_goals(loaded, settings["robots"]):
-            _say(f"warning: {warning}")
     with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, located(loaded):
         if loaded is None:
             kept = {key: settings[key] for key in ("rounds", "until", "checkpoint")}
@@ -226,19 +223,6 @@ def run(
         if not (quiet or as_json):
             _say(f"written: {', '.join(map(str, (result.summary['result'], *figures)))}")
     return tell(result, quiet=quiet, as_json=as_json)
-
-
-def _blocked_goals(scenario: Scenario, kind: str | None = None) -> list[str]:
-    """Warnings about goals in obstacles, with robots of this kind, or of the scenario's if None."""
-    from consat.runs.preparation import robots_of
-
-    with located(scenario):
-        robots = robots_of(kind, None, scenario)
-    if robots is None:
-        return []
-    from consat.scenario.robots import blocked_goals
-
-    return blocked_goals(robots, scenario.team)
 
 
 def _meet(processes: int | None, coordinator: str | None, process: int | None, of: int | None) -> bool:
@@ -276,12 +260,13 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     from consat.certify.assumptions import report
     from consat.problem.graphs import require_connected
     from consat.runs.preparation import told
+    from consat.scenario.robots import blocked_goals
     from consat.views import tables
 
     findings = report(loaded.team)
     if findings["communication_connected"]:
         findings |= told(loaded.team, loaded.settings.protocol)
-    findings["warnings"] = _blocked_goals(loaded)
+    findings["warnings"] = [] if loaded.robots is None else blocked_goals(loaded.robots, loaded.team)
     if as_json:
         click.echo(json.dumps(findings))
     else:

@@ -17,7 +17,7 @@ from consat.results.trace import Trace
 from consat.runs.advice import warnings_of
 from consat.runs.verdicts import verdicts
 from consat.scenario import Scenario
-from consat.scenario.robots import Robots
+from consat.scenario.robots import Robots, blocked_goals
 from consat.settings import Settings
 
 SCHEMA = "consat.run/1"
@@ -84,9 +84,12 @@ def summarise(
         "verdicts": _verdicts(whole, trace, since) if whole.moves else None,
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
-        "warnings": warnings_of(
-            team, trace, schedule.at(float(trace.steps[-1])) if trace.clock == "time" else nu, size, str(settings.protocol.kind)
-        ),
+        "warnings": [
+            *([] if robots is None else blocked_goals(robots, team)),
+            *warnings_of(
+                team, trace, schedule.at(float(trace.steps[-1])) if trace.clock == "time" else nu, size, str(settings.protocol.kind)
+            ),
+        ],
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
     } | ({"robots": None, "obstacles": None} if robots is None else robots.told)
