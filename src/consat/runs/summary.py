@@ -85,7 +85,7 @@ def summarise(
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
         "count": team.count,
         "warnings": [
-            *([] if robots is None else blocked_goals(robots, team)),
+            *([] if robots is None else blocked_goals(robots, whole)),
             *warnings_of(
                 team, trace, schedule.at(float(trace.steps[-1])) if trace.clock == "time" else nu, size, str(settings.protocol.kind)
             ),
