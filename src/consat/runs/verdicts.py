@@ -43,29 +43,20 @@ class Instant(NamedTuple):
 
 
 def verdicts(
-    team: Team,
-    duration: float,
-    seen: Callable[[float], np.ndarray | None],
-    progress: Callable[[float], None] = lambda _: None,
-    *,
-    since: float = 0.0,
-) -> list[dict[str, Any]]:
+    team: Team, duration: float, seen: Callable[[float], np.ndarray | None], *, since: float = 0.0
+) -> list[dict[str, Any]]:  # fmt: skip
     """Intervals that cover a run, for ``run --json``. Each has ``from`` and ``to``, s, ``verdict``, and ``bounds`` over the interval.
 
     Args:
         team: team with moving constraints.
         duration: duration of the run, s.
         seen: returns the positions in the run at about a given time, s, (N, d), as a candidate; None where they are not recorded.
-        progress: called with the fraction done.
         since: where the intervals begin, s.
     """
     samples = int(np.clip(COSTLY // max(team.count, 1), 8, SAMPLES))
     knots = team.knots[(team.knots > since) & (team.knots < duration)]
     times = np.unique(np.concatenate([np.linspace(since, duration, samples + 1), knots])) if duration > since else np.array([duration])
-    found = []
-    for k, time in enumerate(times.tolist()):
-        found.append(certify(team, time, seen(time)))
-        progress((k + 1) / len(times))
+    found = [certify(team, time, seen(time)) for time in times.tolist()]
     return intervals(_narrowed(team, found, seen))
 
 
