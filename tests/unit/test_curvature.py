@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import consat as cs
 from consat.problem.constraints import apart, box, composition, curvature, displacement, expr, halfspace, near, outside, within
 from consat.problem.constraints.curvature import Curvature, degree, expand, hessians, read_curvatures
 from consat.problem.constraints.functions import safe_norm
@@ -322,6 +323,15 @@ def test_expand() -> None:
 def test_expand_refuses_other_functions() -> None:
     with pytest.raises(ValueError, match="must be a polynomial of degree 0, 1 or 2"):
         expand(lambda x: jnp.exp(x[0]), 1, 2, {})
+
+
+def test_a_psi_that_is_steep_far_away_is_read() -> None:
+    """Second differences near the largest number are more than LAPACK's eigenvalues bear."""
+    others = [cs.Agent(name) for name in "acd"]
+    own = cs.expr("sinh(dot(b - (a + d + c)/3, b))/10 - 0.3682")
+    team = cs.Team([*others, cs.Agent("b", [own])], links="complete", dimension=3)
+    (family,) = team.families
+    assert read_curvatures(family.psi, 4, 3, family.parameters, 1).curvature[0] == Curvature.NOT_CONCAVE
 
 
 def test_psi_must_be_a_number() -> None:

@@ -301,7 +301,9 @@ def _dips(values: Callable[[Array], tuple[Array, Array]], points: Array, reach: 
     ends = corners[..., 1 : n + 1] - corners[..., :1]
     hessian = np.zeros((*points.shape, n))  # by finite differences, which also see kinks within reach; only its eigenvectors are used
     hessian[..., column, row] = corners[..., n + 1 :] - corners[..., :1] - ends[..., row] - ends[..., column]
-    steepest = np.linalg.eigh(np.where(np.isfinite(hessian), hessian, 0))[1][..., -1]
+    hessian = np.where(np.isfinite(hessian), hessian, 0)
+    largest = np.abs(hessian).max(axis=(-2, -1), keepdims=True)  # LAPACK does not converge near the largest number
+    steepest = np.linalg.eigh(hessian / np.where(largest > 0, largest, 1))[1][..., -1]
     random = np.random.default_rng(1).normal(size=points.shape) / np.sqrt(n)
     offsets = np.concatenate([step * reach[..., None] * np.stack([steepest, random], axis=-2) for step in (0.01, 0.1, 1.0, 10.0)], axis=-2)
     (left, middle, right), noise = (
