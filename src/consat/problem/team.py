@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from consat.problem.index import Index, who_is
 from consat.problem.links import Links, pairs_of, topology, unique
 from consat.problem.parameters import Path, vector
 from consat.problem.schedule import FOREVER
-
-if TYPE_CHECKING:
-    pass
 
 MOST_NAMED = 100_000
 """With at most this many constraints, all names are built at once; with more, each name is built on access."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from consat.errors import ConsatError, Fault, InvalidInput, InvalidTeam, shown
 from consat.problem.agent import Agent
+from consat.problem.changes import named
 from consat.problem.team import Team
 from consat.runs.preparation import robots_of
 from consat.runs.session import Session
@@ -20,7 +21,7 @@ from consat.server import orders, targets
 from consat.server.display import Display
 from consat.server.orders import Order
 from consat.server.silent import Silent
-from consat.server.targets import Target, named, parameters_of
+from consat.server.targets import Target, parameters_of
 
 MOST_UNDONE: Final = 100
 

@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from consat.errors import Fault, InvalidTeam
+from consat.problem.changes import named
 from consat.problem.family import Family
 from consat.problem.team import Team
 
@@ -66,21 +67,10 @@ def _targets(team: Team, numbers: list[int]) -> list[Target]:
 
 def place_of(team: Team, number: int) -> tuple[Family, int]:
     """The family of a constraint, and its row."""
-    for family in team.families:
-        found = np.flatnonzero(family.number == number)
-        if len(found):
-            return family, int(found[0])
-    raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
-
-
-def named(team: Team, agent: str, constraint: str) -> list[int]:
-    """Indices of the constraints of an agent with a name, or of the sides of a box; empty if there is none."""
-    ids = list(team.ids)
-    if agent not in ids:
-        return []
-    own = [int(k) for k in np.flatnonzero(team.owner == ids.index(agent))]
-    exact = [k for k in own if team.names[k] == constraint]
-    return exact or [k for k in own if team.names[k].startswith((f"{constraint}.low[", f"{constraint}.high["))]
+    if not 0 <= number < len(team.owner):
+        raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
+    f, row = team.slots[number].tolist()
+    return team.families[f], row
 
 
 def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> dict[str, Any]:
