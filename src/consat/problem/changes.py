@@ -141,7 +141,7 @@ def _sides(
     if unknown := [key for key in parameters if key not in ("low", "high", "weight")]:
         raise InvalidTeam([Fault((), f"there is no parameter {unknown[0]!r}; it has low, high and weight", where)])
     own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
-    limits = {side: parameters.get(side, _parameter(team, k, side, now)) for side, k in own.items()}
+    limits = {side: parameters.get(side, parameter(team, k, side, now)) for side, k in own.items()}
     faults: list[Fault] = []
     checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
     if faults:
@@ -153,11 +153,12 @@ def _sides(
     ]
 
 
-def _parameter(team: Team, number: int, key: str, now: Sequence[Mapping[str, Any]]) -> Moving:
-    """The current value of a parameter of one constraint, or its schedule if it moves with time."""
+def parameter(team: Team, number: int, key: str, now: Sequence[Mapping[str, Any]] | None = None) -> Moving:
+    """The current value of a parameter of one constraint, or its schedule if it moves with time. `now`: as in `changes_of`."""
     f, m = team.slots[number].tolist()
-    track = team.families[f].tracks.get(key)
-    return (track and track.schedule(m)) or np.asarray(now[f][key])[m]
+    family = team.families[f]
+    track = family.tracks.get(key)
+    return (track and track.schedule(m)) or np.asarray((family.parameters if now is None else now[f])[key])[m]
 
 
 def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) -> dict[str, Moving]:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from consat.errors import Fault, InvalidTeam
-from consat.problem.changes import named
+from consat.problem.changes import named, parameter
 from consat.problem.family import Family
 from consat.problem.team import Team
 
@@ -82,7 +82,5 @@ def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> di
             if key == "weight":
                 found[key] = float(family.weight[k])
             elif key in family.parameters:
-                track = family.tracks.get(key)
-                schedule = None if track is None else track.schedule(k)
-                found[key] = np.array(family.parameters[key][k]) if schedule is None else schedule
+                found[key] = parameter(team, number, key)
     return found
