@@ -11,6 +11,7 @@ import pytest
 
 import consat as cs
 from consat.certify.optimum import max_min
+from consat.problem.units import scale
 from tests.unit import teams
 
 
@@ -127,3 +128,34 @@ def test_the_default_goes_by_the_structure_of_the_team() -> None:
     assert cs.run("lattice", rounds=1, protocol="max-min").summary["route"] == "tree"
     assert cs.run("swarm", rounds=1).summary["protocol"] == "admm", "not concave, with loops"
     assert cs.run(cs.load("convoy", ["count=6000"]), rounds=1).summary["protocol"] == "admm"
+
+
+def _three(*psis: str) -> cs.Team:
+    """a, b and c, linked with one another, with one ψ each."""
+    return cs.Team([cs.Agent(name, [cs.expr(psi)]) for name, psi in zip("abc", psis, strict=True)], [("a", "b"), ("b", "c"), ("a", "c")])
+
+
+def test_the_default_with_loops_goes_by_the_kind_of_what_is_not_concave() -> None:
+    plain = "4 - norm2(b)", "4 - norm2(c)"
+    for psi, protocol in (("norm(a - b) - 1", "admm"), ("norm2(a - b) - 1", "admm"), ("sin(norm2(a - b))", "interior-point")):
+        assert cs.run(_three(psi, *plain), rounds=1).summary["protocol"] == protocol, psi
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_model_that_holds_only_nearby_is_not_relied_on_far_away(seed: int) -> None:
+    """Exponentials and poles: whole steps lead to where ψ overflows."""
+    team = _three(
+        "log(1 + exp(2.89 - (a - c)[0])) - 1.4", "(2.4 - 2/norm(b)) * log(1 + exp(4.5 - (b - a)[1])) - 3.6", "tan(norm2(c - a)/4) + 2.8"
+    )
+    result = cs.run(team, protocol="interior-point", start=(-4, 4), seed=seed)
+    assert result.summary["status"] == "satisfied"
+    assert np.abs(result.data["position"].values).max() < 1e3
+
+
+def test_who_only_keeps_apart_is_not_thrown_far_away() -> None:
+    team = cs.Team([cs.Agent("a", [cs.within([0, 0], 1)]), cs.Agent("b", [cs.apart("a", 1)])])
+    for seed in range(3):
+        result = cs.run(team, seed=seed)
+        assert result.summary["status"] == "satisfied"
+        moves = np.linalg.norm(np.diff(result.data["position"].values, axis=0), axis=-1)
+        assert moves.max() < 4 * scale(team).reach

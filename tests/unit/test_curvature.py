@@ -70,6 +70,19 @@ def test_library_kind(make: Callable[[int], Any], kind: Curvature, strict_in: tu
     assert degree(made.psi, arity, d, _values(made)) == power
 
 
+@pytest.mark.parametrize(
+    ("psi", "convex"),
+    [
+        ("norm(a2 - a3) - 2", True), ("norm2(a2) - 1", True), ("a2.x - 1", True), ("a2.x*a3.x", False), ("4 - norm2(a2)", False),
+        ("exp(norm2(a2 - a3))", True), ("sin(a2.x)", False), ("1/norm(a2)", False),
+    ],
+)  # fmt: skip
+def test_convex(psi: str, convex: bool) -> None:
+    made = expr(psi)
+    readings = read_curvatures(made.psi, len(made.reads), 2, {key: value[None] for key, value in _values(made).items()}, 1)
+    assert readings.convex.tolist() == [convex]
+
+
 # ------------------------------------------------------------------------------------------------------- rule by rule, d = 2
 
 

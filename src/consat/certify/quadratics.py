@@ -41,6 +41,7 @@ class Shape:
         strict_in_own: (M,) whether ψ is strictly concave in the owner's position, with the others fixed.
         quadratic: (M,) whether ψ is a polynomial of degree ≤ 2.
         concave: (M,) whether ψ is concave in all positions jointly.
+        convex: (M,) whether ψ is convex in all positions jointly.
         hessians: for each family the (M_f, n, n) constant weighted Hessians, n = arity·d; None if its degree is above 2 or unknown.
     """
 
@@ -48,6 +49,7 @@ class Shape:
     strict_in_own: Bools
     quadratic: Bools
     concave: Bools
+    convex: Bools
     hessians: tuple[Floats | None, ...]
 
 
@@ -56,16 +58,17 @@ def shape_of(team: Team) -> Shape:
     """The proven curvature of all constraints of a team. Cached by team."""
     count = len(team.owner)
     curvature = np.full(count, Curvature.UNKNOWN, dtype=object)
-    strict, quadratic, concave = np.zeros((3, count), dtype=bool)
+    strict, quadratic, concave, convex = np.zeros((4, count), dtype=bool)
     constant: list[Floats | None] = []
     for family in team.families:
         readings = read_curvatures(family.psi, family.arity, team.dimension, family.lasting, family.size)
         curvature[family.number] = once(readings.curvature)
         concave[family.number] = readings.concave
+        convex[family.number] = readings.convex
         strict[family.number] = np.any(once(readings.strict_in) & (family.agents == family.owner[:, None]), axis=1)
         quadratic[family.number] = readings.degree is not None
         constant.append(None if readings.degree is None else _hessians(family, team.dimension))
-    return Shape(curvature, strict, quadratic, concave, tuple(constant))
+    return Shape(curvature, strict, quadratic, concave, convex, tuple(constant))
 
 
 def _hessians(family: Family, dimension: int) -> Floats:

@@ -31,6 +31,8 @@ STRAIGHT = 1e-6
 """Relative cutoff for the eigenvalues of the Hessian of a ψ that is not quadratic. Smaller ones count as 0."""
 FLATTER = 0.5
 """A Newton step is taken to reach a stationary point of ψ if the gradient norm falls at least to this fraction."""
+BENT = 0.1
+"""And if the curvature there is at least this fraction of the one at the origin. A ψ that levels off is flat far away."""
 RIM, ROOM = 0.1, 1.0
 """Widest distance outside the region, relative to its reach, at which distant initial estimates are placed; see `Region.nearby`. `RIM` is
 for convex teams. `ROOM` is for others, where agents need space to move around one another."""
@@ -174,7 +176,8 @@ def _between(stationary: np.ndarray, arity: int) -> np.ndarray:
 def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
     """As `_measure`, for ψ that is not a quadratic: one Newton step from the origin.
 
-    The step counts if the gradient norm falls to `FLATTER` of its value. Otherwise ψ is treated as affine, with its gradient at the origin.
+    The step counts if the gradient norm falls to `FLATTER` of its value and the curvature does not fall below `BENT` of its value.
+    Otherwise ψ is treated as affine, with its gradient at the origin.
     """
 
     def look(at: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -185,11 +188,13 @@ def _measure_any(family: Family, dimension: int) -> tuple[np.ndarray, ...]:
         return usable, *(np.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in (value, slope, hessian))
 
     usable, _, slope, hessian = look(np.zeros((family.size, family.arity * dimension)))
+    before = np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0)
     stationary = -np.matmul(np.linalg.pinv(hessian, STRAIGHT, hermitian=True), slope[..., None])[..., 0]
     there, value, flatter, hessian = look(stationary)
     steep = np.linalg.norm(slope, axis=1)
-    curved = usable & there & (np.linalg.norm(flatter, axis=1) <= FLATTER * steep)
-    bend = np.where(curved, np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0), 0.0)
+    bend = np.abs(np.linalg.eigvalsh(hessian)).max(axis=1, initial=0.0)
+    curved = usable & there & (np.linalg.norm(flatter, axis=1) <= FLATTER * steep) & (bend >= BENT * before)
+    bend = np.where(curved, bend, 0.0)
     centers = stationary[bend > 0] if family.arity == 1 else np.zeros((0, dimension))
     between = np.where(curved, _between(stationary, family.arity), 0.0)
     return np.abs(value) * family.weight, bend * family.weight, steep * family.weight, centers, between

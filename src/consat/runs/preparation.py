@@ -82,8 +82,9 @@ def why_admm(team: Team, layout: Layout) -> str | None:
         return f"there are more than {MANY:,} agents, and a round of admm takes less time"
     if layout == "full" and team.count > FULL:
         return f"there are more than {FULL} agents of which everybody holds everything, and messages would be too wide"
-    if not shape_of(team).concave.all() and len(team.links) >= team.count:
-        return "some constraints are not concave and the links form loops, where admm takes fewer rounds"
+    shape = shape_of(team)
+    if not shape.concave.all() and (shape.concave | shape.convex | shape.quadratic).all() and len(team.links) >= team.count:
+        return "some constraints keep agents apart and the links form loops, where admm takes fewer rounds"
     if (length := loop_length(team.count, team.links)) > LONG:
         return f"the links form loops of {length:.0f} agents on the average, where admm takes fewer rounds"
     return None

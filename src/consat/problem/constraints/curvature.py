@@ -71,11 +71,13 @@ class Readings:
 
     Attributes:
         curvature: (M,) of `Curvature`, in all positions jointly.
+        convex: (M,) bool: whether ψ is convex in all positions jointly.
         strict_in: (M, arity) bool: whether ψ is strictly concave in one position alone, with the others fixed.
         degree: upper bound (0, 1 or 2) on the degree of every ψ as a polynomial in the positions; None if no such bound is proven.
     """
 
     curvature: Array
+    convex: NDArray[np.bool_]
     strict_in: NDArray[np.bool_]
     degree: int | None
 
@@ -117,14 +119,14 @@ def read_curvatures(
     family = _Family.of(psi, arity, dimension, stacked_parameters, members)
     nodes = family.nodes()
     parts = [_classify(node, arity, count, moving=family.moving) for count, node in nodes]
-    code, strict_in = (stacked(part) for part in zip(*parts, strict=True))
+    code, convex, strict_in = (stacked(part) for part in zip(*parts, strict=True))
     undecided = np.flatnonzero(code == _UNKNOWN)
     if undecided.size:
         code = np.array(code)
         code[undecided[_refuted(family, undecided)]] = _NOT
     degrees = [None if node.terms is None else node.degree for _, node in nodes]
     labels = _repeated(_LABELS[once(code)], len(code))
-    return Readings(labels, strict_in, highest(degrees))
+    return Readings(labels, convex, strict_in, highest(degrees))
 
 
 def degree(psi: Psi, arity: int, dimension: int, example_parameters: Mapping[str, ArrayLike]) -> int | None:
@@ -214,7 +216,7 @@ class _Family:
 
 
 @np.errstate(all="ignore")
-def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array]:
+def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array, Array]:
     """The curvature of ψ from its node.
 
     Args:
@@ -224,22 +226,27 @@ def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> 
         moving: whether NaN in the constant and linear terms comes from moving parameters and is therefore allowed.
 
     Returns:
-        (M,) indices into `_LABELS` and (M, arity) `strict_in`.
+        (M,) indices into `_LABELS`, (M,) `convex` and (M, arity) `strict_in`.
     """
     if node.terms is None:
         bend = node.bend
         strict = np.broadcast_to(bend.strict, (*bend.strict.shape[:-1], arity + 2))
         code = np.select([bend.concave & strict[:, 0], bend.concave, bend.convex & strict[:, -1]], [_STRICTLY, _CONCAVE, _NOT], _UNKNOWN)
-        return _repeated(code, members), _repeated(bend.concave[:, None] & strict[:, 1:-1], members)
-    code, strict_in = np.array([_CONCAVE]), np.zeros((1, arity), bool)
+        strict_in = bend.concave[:, None] & strict[:, 1:-1]
+        return _repeated(code, members), _repeated(bend.convex, members), _repeated(strict_in, members)
+    code, convex, strict_in = np.array([_CONCAVE]), np.ones(1, bool), np.zeros((1, arity), bool)
     if node.degree == 2:
-        largest = [signs(block(node.terms[2], slot), block(node.sizes[2], slot))[1] for slot in (None, *range(arity))]
-        code, strict_in = np.choose(largest[0].astype(int) + 1, [_STRICTLY, _CONCAVE, _NOT]), np.stack(largest[1:], axis=-1) < 0
+        smallest, largest = zip(
+            *(signs(block(node.terms[2], slot), block(node.sizes[2], slot)) for slot in (None, *range(arity))), strict=True
+        )
+        code, convex = np.choose(largest[0].astype(int) + 1, [_STRICTLY, _CONCAVE, _NOT]), smallest[0] >= 0
+        strict_in = np.stack(largest[1:], axis=-1) < 0
     finite = np.ones(1, bool)
     for order, part in enumerate(node.sizes):
         good = ~np.isinf(part) if moving and order < 2 else np.isfinite(part)
         finite = finite & good.all(tuple(range(1, part.ndim)))
-    return _repeated(np.where(finite, code, _UNKNOWN), members), _repeated(strict_in & finite[:, None], members)
+    found = np.where(finite, code, _UNKNOWN), convex & finite, strict_in & finite[:, None]
+    return _repeated(found[0], members), _repeated(found[1], members), _repeated(found[2], members)
 
 
 def _repeated(array: Array, members: int) -> Array:

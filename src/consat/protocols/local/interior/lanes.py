@@ -7,6 +7,7 @@ most `cap`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from jax import Array
 
 from consat.numerics import on_device
 from consat.problem.units import Scale
-from consat.protocols.local.interior.layout import Batch, Kind
+from consat.protocols.local.interior.layout import Batch, Form, Kind
 from consat.protocols.local.lanewise import along, arguments
 
 
@@ -72,14 +73,28 @@ class Lanes:
     @property
     def moves(self) -> Array:
         """(A,) whether an agent has constraints that move with time."""
-        moving = [kind.used.any(axis=0) for form, kind in self._each() if form.moves]
-        return jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *moving]), axis=0)
+        return self._any(lambda form: form.moves)
 
     @property
     def quadratic(self) -> Array:
         """(A,) whether all ψ of an agent are quadratic."""
-        others = [kind.used.any(axis=0) for form, kind in self._each() if not form.quadratic]
-        return ~jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *others]), axis=0)
+        return ~self._any(lambda form: not form.quadratic)
+
+    @property
+    def convex(self) -> bool:
+        """Whether all ψ of all agents are concave."""
+        return all(form.concave for form in self.batch.forms)
+
+    @property
+    def concave(self) -> Array:
+        """(A,) whether all ψ of an agent are concave."""
+        return ~self._any(lambda form: not form.concave)
+
+    @property
+    def bent(self) -> Array:
+        """(m, A) which ψ are neither concave nor quadratic: a model of second order holds only near the point where it was made."""
+        own = [kind.used & (not form.concave and not form.quadratic) for form, kind in self._each()]
+        return jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *own, jnp.zeros((1, self.shape[2]), bool)])
 
     @property
     def used(self) -> Array:
@@ -134,6 +149,11 @@ class Lanes:
                 vectors.append(self._placed(kind._replace(slots=rows), found.reshape(m * rank, arity, d, count)))
             done += m
         return jnp.asarray(which, dtype=int), jnp.concatenate(weights), jnp.concatenate(vectors)
+
+    def _any(self, which: Callable[[Form], bool]) -> Array:
+        """(A,) whether an agent has a constraint of such a form."""
+        found = [kind.used.any(axis=0) for form, kind in self._each() if which(form)]
+        return jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *found]), axis=0)
 
     def _each(self) -> Any:
         return zip(self.batch.forms, self.kinds, strict=True)

@@ -19,9 +19,17 @@ from consat.protocols.local.interior.state import Gains, Memory, centered, mean
 
 SHORTEST = 1e-9
 """Smallest step length of the line search; below it the step is not taken."""
+TRUST = 0.5
+"""Largest error of the model of a ψ after a step, as a fraction of its slack or of its predicted change, whichever is larger; for ψ that
+are neither concave nor quadratic. The model is of first order, and of second order where ψ curves downwards."""
 BACK, RAISE, EASE, HEAVIEST = 0.3, 2.0, 0.7, 10.0
 """Adaptive inertia. An agent that steps back by more than `BACK` of its last step multiplies its inertia by `RAISE`, else by `EASE`. The
 result stays between 1 and `HEAVIEST` times the gain `inertia` of the protocol."""
+STIFFEST = 1e12
+"""As `HEAVIEST`, for an agent whose step was shortened because its model is poor. Its inertia becomes such that the full step would have
+had that length (Levenberg, Marquardt). Its quadratics contain it too: neighbours must not rely on a model that holds only nearby."""
+HELD = 1e4
+"""Factor on the inertia of an agent with ψ of that kind while it knows that the team is satisfied. It might not find back."""
 GAP = 1e-2
 """Difference of levels, in units of ψ, below which a level is not lowered at once."""
 
@@ -94,12 +102,13 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
 
     began = memory._replace(y=predicted(lanes, memory))
     here = Here.of(lanes, began.y)
-    point = lowered(lanes, here, memory, lowest, gains)
-    y, level, multiplier, swing, back = moved(lanes, here, began, point, theirs, gains)
-    inertia = jnp.clip(memory.inertia * jnp.where(back, RAISE, EASE), 1.0, HEAVIEST)
+    known = jnp.minimum(told, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
+    held = jnp.where((known > 0) & lanes.bent.any(axis=0), HELD, 1.0)
+    point = lowered(lanes, here, memory._replace(inertia=held * memory.inertia), lowest, gains)
+    y, level, multiplier, swing, inertia = moved(lanes, here, began, point, theirs, gains)
 
     here = Here.of(lanes, y)
-    point = renewed(lanes, here, point._replace(level=level, multiplier=multiplier, inertia=inertia), inbox, gains)
+    point = renewed(lanes, here, point._replace(level=level, multiplier=multiplier, inertia=held * inertia), inbox, gains)
     rest = jnp.maximum(memory.warm - 1.0, 0.0)
     point = point._replace(warm=rest > 0)
     proof, bound = prove(lanes, shared, held, y, here=here, multiplier=point.multiplier, inbox=proofs)
@@ -147,7 +156,7 @@ def moved(
     """Take the Newton step. `theirs`: (N, N, A) matrix and (N, A) vector, the sum of the neighbours' quadratics.
 
     Returns:
-        (n, d, A) copies, (A,) level, (m, A) multipliers, (A,) `Memory.swing`, and (A,) whether the step goes back on the last one.
+        (n, d, A) copies, (A,) level, (m, A) multipliers, (A,) `Memory.swing`, and (A,) `Memory.inertia`.
     """
     y, (outside, pull) = memory.y, theirs
     n, d, count = y.shape
@@ -157,15 +166,34 @@ def moved(
     step, _ = solve(matrix + outside, (pull - gradient - times(outside, flat))[:, None])
     step = jnp.where(jnp.isfinite(step).all(axis=(0, 1)), step[:, 0], 0.0)
     least = jnp.where(warm[None], -jnp.inf, (1.0 - gains.boundary) * s)
-    scale = longest(lanes, flat, step, jnp.where(used, least, -jnp.inf), used)
+    scale, cut = length_of(lanes, here, point, flat, step, jnp.where(used, least, -jnp.inf))
     swing = jnp.sum(jnp.cos(2.4 * jnp.arange(1.0, n * d + 1))[:, None] * step[:-1], axis=0) * scale
     back = swing * memory.swing < -BACK * memory.swing**2
+    inertia = jnp.clip(memory.inertia * jnp.where(back, RAISE, EASE), 1.0, HEAVIEST)
+    if not lanes.convex:
+        inertia = jnp.maximum(inertia, stiffened(memory.inertia, matrix + outside, step, cut, gains))
     flat = flat + scale[None] * step
     along = jnp.sum(here.slopes * step[None, :-1], axis=1) - step[-1][None]
     change = jnp.where(used, barrier[None] / s - multiplier - multiplier / s * along, 0.0)
     room = jnp.where(change < 0, gains.boundary * multiplier / jnp.where(change < 0, -change, 1.0), 1.0)
     multiplier = multiplier + jnp.minimum(1.0, jnp.min(room, axis=0))[None] * change
-    return flat[:-1].reshape(y.shape), flat[-1], multiplier, swing, back
+    return flat[:-1].reshape(y.shape), flat[-1], multiplier, swing, inertia
+
+
+def stiffened(inertia: Array, matrix: Array, step: Array, cut: Array, gains: Gains) -> Array:
+    """(A,) inertia with which the full step would have been shorter by the factor `cut`; `EASE` · `inertia` if that is more.
+
+    Args:
+        inertia: (A,) `Memory.inertia` before the step.
+        matrix: (N, N, A) matrix of the step.
+        step: (N, A) full step.
+        cut: (A,) see `length_of`.
+        gains: gains of the protocol.
+    """
+    square = jnp.sum(step[:-1] ** 2, axis=0)
+    stiffness = jnp.sum(step * times(matrix, step), axis=0) / jnp.where(square > 0, square, 1.0)
+    wanted = jnp.where(cut > 1.0, (cut - 1.0) * stiffness / gains.inertia, 0.0)
+    return jnp.minimum(jnp.maximum(EASE * inertia, wanted), STIFFEST)
 
 
 def renewed(lanes: Lanes, here: Here, point: Point, inbox: Mail, gains: Gains) -> Point:
@@ -238,26 +266,48 @@ def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
     return matrix + jnp.eye(len(matrix))[:, :, None] * jnp.where(last, own[None], still[None])[:, None], gradient
 
 
-def longest(lanes: Lanes, flat: Array, step: Array, least: Array, used: Array) -> Array:
-    """(A,) step length by backtracking: after the step every slack is at least `least` and every used ψ is finite; 0 if none is found.
+def length_of(lanes: Lanes, here: Here, point: Point, flat: Array, step: Array, least: Array) -> tuple[Array, Array]:
+    """Length of the step by backtracking.
 
     Args:
         lanes: the agents' constraints.
+        here: ψ and its derivatives before the step.
+        point: the point before the step.
         flat: (N, A) variables before the step.
         step: (N, A) full step.
         least: (m, A) lower bounds on the slacks.
-        used: (m, A) which constraints count.
-    """
 
-    def good(scale: Array) -> Array:
+    Returns:
+        (A,) the length; 0 if none is found. After the step every slack is at least `least` and every used ψ is finite. The model of every
+        ψ is as good as `TRUST` asks. An agent with ψ that are not concave goes no further than across the team's region, or than it is
+        from the region's centre. (A,) the factor by which the last two conditions have shortened the step.
+    """
+    used, bent = point.used, lanes.bent & point.used
+    way, away = (jnp.max(jnp.abs(each[:-1]), axis=0, initial=0.0) for each in (step, flat))
+    most = jnp.where(lanes.concave, jnp.inf, lanes.units.reach + away)
+    first, second = jnp.sum(here.slopes * step[None, :-1], axis=1), jnp.zeros(used.shape)
+    which, weights, vectors = here.bends
+    if len(which):
+        second = second.at[which].add(weights * jnp.sum(vectors * step[None, :-1], axis=1) ** 2)
+
+    def good(scale: Array) -> tuple[Array, Array]:
         new = flat + scale[None] * step
         psi = lanes.psi(new[:-1].reshape(lanes.shape))
-        return jnp.all((psi - new[-1][None] >= least) & ((psi > -jnp.inf) | ~used), axis=0)
+        fine = (psi - new[-1][None] >= least) & ((psi > -jnp.inf) | ~used)
+        if lanes.convex:
+            return jnp.all(fine, axis=0), jnp.all(fine, axis=0)
+        error = jnp.abs(psi - (here.psi + scale[None] * first - 0.5 * scale[None] ** 2 * second))
+        close = (error <= TRUST * jnp.maximum(point.slack, scale[None] * jnp.abs(first))) | ~bent
+        close &= (scale * way <= most)[None]
+        return jnp.all(fine, axis=0), jnp.all(fine & close, axis=0)
 
-    def body(at: tuple[Array, Array]) -> tuple[Array, Array]:
-        scale, done = at
-        scale = jnp.where(done, scale, jnp.where(scale > SHORTEST, 0.7 * scale, 0.0))
-        return scale, good(scale) | (scale == 0.0)
+    def body(at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        scale, bound, fine, close = at
+        shorter = jnp.where(scale > SHORTEST, 0.7 * scale, 0.0)
+        scale, bound = jnp.where(close, scale, shorter), jnp.where(fine, bound, shorter)
+        now = good(scale)
+        return scale, bound, fine | now[0] | (scale == 0.0), close | now[1] | (scale == 0.0)
 
     whole = jnp.ones(flat.shape[-1])
-    return jax.lax.while_loop(lambda at: jnp.any(~at[1]), body, (whole, good(whole)))[0]
+    scale, bound, *_ = jax.lax.while_loop(lambda at: jnp.any(~at[3]), body, (whole, whole, *good(whole)))
+    return scale, jnp.where(bound > scale, bound / jnp.maximum(scale, SHORTEST), 1.0)
