@@ -84,6 +84,12 @@ class Start(Model):
         return box
 
 
+Layout = Literal["local", "full"]
+"""Which positions an agent holds estimates of: those that it needs, or all (as in the paper)."""
+Sends = Literal["all", "events"]
+"""When agents send: in every round, or only news."""
+Stop = Literal["satisfied", "converged", "never"]
+"""Condition that ends a run before its limit of time or rounds."""
 ProtocolKind = Literal["interior-point", "gradient-flow", "proportional-integral", "selfish", "proximal", "admm", "max-min"]
 
 
@@ -92,7 +98,7 @@ class ProtocolSettings(Model):
 
     Attributes:
         kind: name of the protocol; None for the default.
-        estimates: which positions an agent holds estimates of: ``local`` those that it needs, ``full`` all (as in the paper).
+        estimates: see `Layout`.
         k1: gain of a flow on the gradient.
         k2: gain of a flow on the disagreement between estimates.
         penalty: initial ρ of admm, in 1/length².
@@ -101,7 +107,7 @@ class ProtocolSettings(Model):
     """
 
     kind: ProtocolKind | None = Field(None, description=f"one of {', '.join(get_args(ProtocolKind))}")
-    estimates: Literal["local", "full"] = Field("local", description="local or full")
+    estimates: Layout = Field("local", description="local or full")
     k1: Gain | None = Field(None, description="a positive number")
     k2: Gain | None = Field(None, description="a positive number")
     penalty: Gain | None = Field(None, description="a positive number")

@@ -18,8 +18,8 @@ from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
-from consat.protocols.sending import Sends
 from consat.scenario import load
+from consat.settings import Sends
 
 ROUNDS = 120
 KILLS = ((0.1, "a2"), (0.8, "a1"))

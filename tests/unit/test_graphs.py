@@ -12,7 +12,8 @@ from consat.certify.assumptions import report
 from consat.network.node.part import split
 from consat.numerics import float64
 from consat.problem import graphs
-from consat.protocols.estimates import Estimates, Layout
+from consat.protocols.estimates import Estimates
+from consat.settings import Layout
 from consat.views import tables
 
 

@@ -39,11 +39,11 @@ from consat.cli.terminal import (
     json_option,
     located,
     out_option,
-    protocols,
     scenario_argument,
     sends_option,
     set_option,
     tell,
+    words,
 )
 from consat.errors import ConsatError, InvalidInput, InvalidSettings, closest
 from consat.network.deploy.environment import keep_compilations
@@ -125,18 +125,6 @@ def _numbers(context: click.Context, parameter: click.Parameter, value: str | No
         raise click.BadParameter(f"{value!r} must be numbers, such as 0.1,0 for wind along x") from None
 
 
-def _robots() -> Iterable[str]:
-    from consat.scenario.robots import KINDS
-
-    return KINDS
-
-
-def _simulators() -> Iterable[str]:
-    from consat.robots.simulated import SIMULATORS
-
-    return SIMULATORS
-
-
 def _names(context: click.Context, parameter: click.Parameter, value: str | None) -> Any:
     return value if value in (None, "all", "none") else [name.strip() for name in str(value).split(",")]
 
@@ -149,7 +137,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
     metavar="KIND",
     shell_complete=completion.protocols,
     cls=Listing,
-    listed=protocols,
+    listed=words("consat.settings", "ProtocolKind"),
     help="One of {}; interior-point if not given, or admm for large teams.",
 )
 @estimates_option
@@ -161,16 +149,16 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
     metavar="SECONDS",
     help="End of the run; implies --stop never. In rounds with --rate.",
 )
-@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end earlier.")
+@click.option("--stop", type=OneOf(words("consat.settings", "Stop")), help="When to end earlier.")
 @click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that a message is lost.")
 @click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Probability that an agent skips a round.")
 @click.option("--burst", type=Burst(), help="Links turn bad with probability P a round, good again with Q.")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Rounds a second, where rounds take time.")
 @click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s; needs --rate.")
-@click.option("--robots", type=OneOf(_robots), help="What bodies are; by default the scenario's.")
+@click.option("--robots", type=OneOf(words("consat.scenario.robots", "KINDS")), help="What bodies are; by default the scenario's.")
 @click.option("--wind", callback=_numbers, metavar="VX,VY", help="Velocity of the air, m/s, for robots.")
 @click.option("--noise", type=click.FloatRange(min=0), default=0.0, metavar="M", help="What a robot's position is measured wrong by, m.")
-@click.option("--simulator", metavar="NAME", cls=Listing, listed=_simulators,
+@click.option("--simulator", metavar="NAME", cls=Listing, listed=words("consat.robots.simulated", "SIMULATORS"),
               help="Integrates the bodies of robots: {}; by default the robots' own models do.")  # fmt: skip
 @sends_option
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
@@ -312,10 +300,10 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 @click.option("--seeds", type=click.IntRange(min=1), default=1, metavar="COUNT", help="How many seeds for each combination of values.")
 @click.option("--seed", type=click.IntRange(min=0), help="The first of them; start.seed if not given.")
 @click.option("--protocol", metavar="KIND", shell_complete=completion.protocols, help="As for run, as is all that follows.")
-@click.option("--estimates", type=click.Choice(["local", "full"]))
+@click.option("--estimates", type=OneOf(words("consat.settings", "Layout")))
 @click.option("--rounds", type=click.IntRange(min=0))
 @click.option("--until", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS")
-@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]))
+@click.option("--stop", type=OneOf(words("consat.settings", "Stop")))
 @click.option("--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0)
 @click.option("--sleep", type=click.FloatRange(0, 1, max_open=True), default=0.0)
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS")

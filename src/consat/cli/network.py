@@ -12,6 +12,8 @@ from consat.cli.completion import agents, protocols
 from consat.cli.terminal import (
     DONE,
     Burst,
+    Listing,
+    OneOf,
     estimates_option,
     force_option,
     full_option,
@@ -22,6 +24,7 @@ from consat.cli.terminal import (
     sends_option,
     set_option,
     tell,
+    words,
 )
 from consat.errors import counted
 from consat.network.deploy.environment import prepare_own
@@ -29,17 +32,19 @@ from consat.network.deploy.environment import prepare_own
 if TYPE_CHECKING:
     from consat.network.node.part import Part
 
-MODES = ["interior-point", "admm", "link", "lockstep"]
-
 protocol_option = click.option(
     "--protocol",
     metavar="KIND",
     shell_complete=protocols,
-    help="For --mode lockstep: interior-point (default), max-min, admm, proximal; else as the mode is called.",
+    cls=Listing,
+    listed=words("consat.protocols", "ROUNDS"),
+    help="For --mode lockstep: one of {}, by default interior-point; else as the mode is called.",
 )
 port_option = click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Of the first agent.")
 mode_option = click.option(
-    "--mode", type=click.Choice(MODES), help="How they talk; admm if that is the protocol of the scenario, else interior-point."
+    "--mode",
+    type=OneOf(words("consat.network.node.modes", "Mode")),
+    help="How they talk; admm if that is the protocol of the scenario, else interior-point.",
 )
 rate_option = click.option("--rate", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Turns a second.")
 speed_option = click.option("--speed", type=click.FloatRange(min=0, min_open=True), help="The most that a body moves, length/s.")
@@ -220,7 +225,7 @@ def agent(
 @delay_option
 @rounds_option
 @until_option
-@click.option("--stop", type=click.Choice(["satisfied", "converged", "never"]), help="When to end; by itself if nothing is said.")
+@click.option("--stop", type=OneOf(words("consat.settings", "Stop")), help="When to end; by itself if nothing is said.")
 @click.option(
     "--commands", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="FILE", help="Timed changes: YAML or JSON lines."
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -68,27 +69,24 @@ class Listing(click.Option):
         return super().get_help_record(ctx)
 
 
-def protocols() -> Iterable[str]:
-    """Names of the protocols."""
-    from consat.settings import ProtocolKind
+def words(module: str, of: str) -> Callable[[], Iterable[str]]:
+    """Function that imports a module and returns the values of a literal type of it, or the names in a registry."""
 
-    return get_args(ProtocolKind)
+    def listed() -> Iterable[str]:
+        found = getattr(importlib.import_module(module), of)
+        return get_args(found) or found
 
-
-def films() -> Iterable[str]:
-    """Endings of films."""
-    from consat.views.animation import FORMATS
-
-    return FORMATS
+    return listed
 
 
+films = words("consat.views.animation", "FORMATS")
 scenario_argument = click.argument("scenario", metavar="FILE", shell_complete=scenarios)
 set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
 estimates_option = click.option(
-    "--estimates", type=click.Choice(["local", "full"]), help="Who holds copies: what is needed, or everything."
+    "--estimates", type=OneOf(words("consat.settings", "Layout")), help="Who holds copies: what is needed, or everything."
 )
 sends_option = click.option(
-    "--sends", type=click.Choice(["all", "events"]), default="all", help="In every round, or only what is news to a neighbour."
+    "--sends", type=OneOf(words("consat.settings", "Sends")), default="all", help="In every round, or only what is news to a neighbour."
 )
 out_option = click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there."

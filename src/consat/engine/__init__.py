@@ -4,8 +4,3 @@ Input: a team, a layout of copies, a protocol of `consat.protocols`. Output: a `
 round of all agents on the data of `world`; `chunks` repeats it on the device, `rules` stop it, and `loop` records. Must not import
 `consat.runs` or `consat.network`.
 """
-
-from typing import Literal
-
-Stop = Literal["satisfied", "converged", "never"]
-"""Condition that ends a run before its limit of time or rounds."""

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.engine import Stop
 from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink
@@ -24,6 +23,7 @@ from consat.problem.units import scale
 from consat.protocols import Flow, State
 from consat.protocols.estimates import Estimates, Exchange
 from consat.results.trace import Ending, Trace, satisfied_from
+from consat.settings import Stop
 
 HOLD = 10.0
 """Time (s) for which every margin must stay positive before a flow counts as satisfied."""

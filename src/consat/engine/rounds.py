@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from jax import Array
 
-from consat.engine import Stop
 from consat.engine.bodies import Body
 from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.chunks import Chunk, Engine, Kept, OneProcess
@@ -34,6 +33,7 @@ from consat.results.trace import Ending, Trace
 from consat.robots.conditions import conditions
 from consat.robots.drive import Drive, Report
 from consat.robots.simulated import Simulated
+from consat.settings import Stop
 
 
 @float64

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from consat.engine import Stop
 from consat.engine.chunks import CHUNK, SURE
 from consat.engine.round import BEST, NEAR, SATISFIED
 from consat.engine.tally import Tally
 from consat.engine.world import World
 from consat.protocols import Rounds
 from consat.results.trace import Ending
+from consat.settings import Stop
 
 ENOUGH = {"satisfied": NEAR, "converged": BEST, "never": 0}
 """For each stop condition the knowledge of all agents that ends a run; see `consat.engine.round.knowledge`."""

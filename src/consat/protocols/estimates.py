@@ -9,7 +9,7 @@ agree (arXiv 2203.00681, 1805.08460).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -20,8 +20,7 @@ from consat.numerics import Groups, on_device, pick
 from consat.problem.family import distinct
 from consat.problem.graphs import clusters, holders, relays, require_connected
 from consat.problem.team import Team
-
-Layout = Literal["full", "local"]
+from consat.settings import Layout
 
 
 @jax.tree_util.register_dataclass

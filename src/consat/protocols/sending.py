@@ -11,7 +11,7 @@ its last message from time to time in case it was lost.
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,6 @@ from jax import Array
 from consat.protocols.agreement import NEVER, Word
 from consat.protocols.base import Rounds, Solver
 
-Sends = Literal["all", "events"]
-"""When agents send: in every round, or only news."""
-SENDS: Final = get_args(Sends)
 PLACE: Final = 1e-4
 """Smallest motion of a body that is news, in the team's unit of length."""
 LAG: Final = 10.0

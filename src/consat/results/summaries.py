@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal, NotRequired, TypedDict
 
+from consat.settings import Layout
+
 Verdict = Literal["feasible", "infeasible", "undecided"]
 
 
@@ -37,7 +39,7 @@ class RunSummary(TypedDict):
     scenario: str
     version: str
     protocol: str
-    estimates: Literal["local", "full"]
+    estimates: Layout
     seed: int
     status: Literal["satisfied", "least-violating", "not-converged", "diverged"]
     verdict: Verdict
@@ -74,7 +76,7 @@ class SweepSummary(TypedDict):
     schema: Literal["consat.sweep/1"]
     scenario: str
     protocol: str
-    estimates: Literal["local", "full"]
+    estimates: Layout
     over: dict[str, list[Any]]
     seeds: list[int]
     count: int

@@ -6,19 +6,16 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 
-from consat.engine import Stop
 from consat.engine.bodies import Body
 from consat.engine.recording import Who
 from consat.errors import InvalidSettings
 from consat.faults import Faults
 from consat.problem.team import Team
-from consat.protocols.estimates import Layout
-from consat.protocols.sending import SENDS, Sends
-from consat.settings import Smoothing
+from consat.settings import Layout, Sends, Smoothing, Stop
 
 if TYPE_CHECKING:
     from consat.scenario.robots import Robots
@@ -72,8 +69,8 @@ class Options:
     sends: Sends = "all"
 
     def __post_init__(self) -> None:
-        if self.sends not in SENDS:
-            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(SENDS)}")
+        if self.sends not in get_args(Sends):
+            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(get_args(Sends))}")
 
     @property
     def events(self) -> bool:

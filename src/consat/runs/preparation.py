@@ -18,11 +18,11 @@ from consat.problem.objective import SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import Scale, automatic, scale, start_box
 from consat.protocols import FLOWS, PAIRED, ROUNDS
-from consat.protocols.estimates import Estimates, Layout
+from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import Way, route_of
 from consat.runs.options import Options
 from consat.scenario import Scenario, dump, load
-from consat.settings import ProtocolSettings, Settings, Start
+from consat.settings import Layout, ProtocolSettings, Settings, Start
 
 if TYPE_CHECKING:
     from consat.robots import Drive

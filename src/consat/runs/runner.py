@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import jax
 
-from consat.engine import Stop
 from consat.engine import checkpoint as checkpoints
 from consat.engine.files import Files, claim
 from consat.engine.flows import simulate_flow
@@ -21,8 +20,7 @@ from consat.errors import InvalidSettings
 from consat.numerics import float64
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS, with_gains
-from consat.protocols.estimates import Estimates, Layout
-from consat.protocols.sending import Sends
+from consat.protocols.estimates import Estimates
 from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
 from consat.runs.advice import around_loops
@@ -31,7 +29,7 @@ from consat.runs.preparation import Prepared, named, robots_of, scenario_of, set
 from consat.runs.restarting import best_start
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
-from consat.settings import Settings, Smoothing
+from consat.settings import Layout, Sends, Settings, Smoothing, Stop
 
 
 def run(

@@ -38,17 +38,15 @@ from consat.problem.parameters import vector
 from consat.problem.team import Team
 from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
-from consat.protocols.estimates import Layout
 from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior.layout import form_of
-from consat.protocols.sending import Sends
 from consat.results.result import Result
 from consat.results.trace import Trace
 from consat.runs.options import RATE, Options
 from consat.runs.preparation import Prepared, copies_of, robots_of, scenario_of, settings_of
 from consat.runs.summary import summarise
 from consat.scenario import Scenario
-from consat.settings import Smoothing
+from consat.settings import Layout, Sends, Smoothing
 
 PLACES = frozenset(("center", "vector", "radius", "low", "high"))
 """Parameters that are lengths: while they are small, a constraint does not ask an agent to move beyond the team's region."""

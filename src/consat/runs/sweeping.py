@@ -17,14 +17,12 @@ import numpy as np
 
 from consat import __version__
 from consat.certify.certificate import bounds
-from consat.engine import Stop
 from consat.engine.batch import Lane, Outcome, like, simulate_batch
 from consat.errors import InvalidSettings, shown
 from consat.faults import Faults
 from consat.numerics import float64, number
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS
-from consat.protocols.estimates import Layout
 from consat.results.summaries import SweepSummary
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, scenario_of, settings_of, with_auxiliary
@@ -32,7 +30,7 @@ from consat.runs.restarting import case_of
 from consat.runs.runner import run
 from consat.runs.summary import status_of
 from consat.scenario import Scenario, loads
-from consat.settings import Start
+from consat.settings import Layout, Start, Stop
 
 SCHEMA = "consat.sweep/1"
 MOST_LISTED = 10_000

@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,13 +26,12 @@ from consat.problem.objective import SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import automatic, scale
 from consat.protocols import ROUNDS
-from consat.protocols.sending import Sends
 from consat.results.result import Result
 from consat.results.trace import Ending
 from consat.runs.preparation import copies_of, default_protocol, told
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, dump
-from consat.settings import Settings
+from consat.settings import Sends, Settings, Stop
 
 PATIENCE: Final = 600.0
 """Time limit of a launch if `Plan.until` is not given, s."""
@@ -46,9 +45,6 @@ BODILESS: Final = (
     "consat agent --sensor stdin commands real ones"
 )
 """Warning for a scenario with robots."""
-
-Stop = Literal["satisfied", "converged", "never"]
-"""Condition for the end of a launch: all agents know the outcome, the team has converged, or none."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from consat.network.node.part import RUNS, Part
 from consat.network.node.station import REPORT, Log, Station
 from consat.network.transports import Transport
 from consat.protocols import PAIRED, ROUNDS, with_gains
-from consat.protocols.sending import BEAT, SENDS, Sends
+from consat.protocols.sending import BEAT
+from consat.settings import Sends
 
 Mode = Literal["interior-point", "admm", "link", "lockstep"]
 DEFAULT_MODE: Final = "interior-point"
@@ -63,8 +64,8 @@ class NodeSettings:
             raise InvalidSettings(f"there is no mode {self.mode!r}; choose one of {', '.join(get_args(Mode))}")
         if self.memory is not None and self.mode != "lockstep":
             raise InvalidSettings(f"mode {self.mode} needs no memory to start anew; only lockstep takes a memory file")
-        if self.sends not in SENDS:
-            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(SENDS)}")
+        if self.sends not in get_args(Sends):
+            raise InvalidSettings(f"sends is {self.sends!r}, but must be one of {', '.join(get_args(Sends))}")
         if self.sends == "events" and self.mode == "link":
             raise InvalidSettings("mode link integrates what it hears in time, and sends all; run another mode to send only what is news")
         if self.pace != 1.0 and self.mode != "link":

@@ -25,6 +25,7 @@ from consat.problem.graphs import middles
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.lanewise import bend_of
+from consat.settings import Layout
 
 Route = Literal["tree", "links"]
 """How copies are exchanged: ``tree``, all along one spanning tree, or ``links``, over all links, each position along a tree of its own."""
@@ -245,7 +246,7 @@ class Way(NamedTuple):
     then: Estimates | None = None
 
 
-def route_of(team: Team, layout: Literal["full", "local"], *, exact: bool = True) -> Way:
+def route_of(team: Team, layout: Layout, *, exact: bool = True) -> Way:
     """Choose how the copies of a team are exchanged. Along a tree the steps are exact and the team proves its bound. Over links with loops
     a satisfying formation is found in fewer rounds, but the smallest violation is often not found and never proven.
 

@@ -28,7 +28,7 @@ result stays between 1 and `HEAVIEST` times the gain `inertia` of the protocol."
 STIFFEST = 1e12
 """As `HEAVIEST`, for an agent whose step was shortened because its model is poor. Its inertia becomes such that the full step would have
 had that length (Levenberg, Marquardt). Its quadratics contain it too: neighbours must not rely on a model that holds only nearby."""
-HELD = 1e4
+HOLD = 1e4
 """Factor on the inertia of an agent with ψ of that kind while it knows that the team is satisfied. It might not find back."""
 GAP = 1e-2
 """Difference of levels, in units of ψ, below which a level is not lowered at once."""
@@ -103,12 +103,12 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     began = memory._replace(y=predicted(lanes, memory))
     here = Here.of(lanes, began.y)
     known = jnp.minimum(told, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
-    held = jnp.where((known > 0) & lanes.bent.any(axis=0), HELD, 1.0)
-    point = lowered(lanes, here, memory._replace(inertia=held * memory.inertia), lowest, gains)
+    hold = jnp.where((known > 0) & lanes.bent.any(axis=0), HOLD, 1.0)
+    point = lowered(lanes, here, memory._replace(inertia=hold * memory.inertia), lowest, gains)
     y, level, multiplier, swing, inertia = moved(lanes, here, began, point, theirs, gains)
 
     here = Here.of(lanes, y)
-    point = renewed(lanes, here, point._replace(level=level, multiplier=multiplier, inertia=held * inertia), inbox, gains)
+    point = renewed(lanes, here, point._replace(level=level, multiplier=multiplier, inertia=hold * inertia), inbox, gains)
     rest = jnp.maximum(memory.warm - 1.0, 0.0)
     point = point._replace(warm=rest > 0)
     proof, bound = prove(lanes, shared, held, y, here=here, multiplier=point.multiplier, inbox=proofs)
