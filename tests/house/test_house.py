@@ -41,6 +41,14 @@ def test_import_stays_light() -> None:
     assert done.stdout.split() == []
 
 
+def test_rounds_call_no_lapack() -> None:
+    """On a CPU two LAPACK calls at once can wait for ever for the threads that they occupy; `lanewise` has what is needed."""
+    sources = [path for room in ("protocols", "engine", "robots") for path in (ROOT / "src" / "consat" / room).rglob("*.py")]
+    found = [path.name for path in sources if re.search(r"(jnp|lax|jsp)\.linalg\.(?!norm\b)|jax\.scipy\.linalg", path.read_text())]
+    assert sources
+    assert not found
+
+
 def test_package_is_typed() -> None:
     assert resources.files("consat").joinpath("py.typed").is_file()
 

@@ -11,6 +11,7 @@ import pytest
 
 import consat as cs
 from consat.certify.optimum import max_min
+from consat.runs.preparation import why_admm
 
 
 def net(radius: float) -> cs.Team:
@@ -88,3 +89,16 @@ def test_long_loops_are_left_to_admm() -> None:
     assert (summary["protocol"], summary["status"]) == ("admm", "satisfied")
     assert "loops of 100 agents" in summary["why"]
     assert summary["satisfied_from"]["round"] <= 60  # 1500 rounds of interior-point did not satisfy two of three rings of 200
+
+
+def test_large_teams_with_many_links_are_left_to_admm() -> None:
+    side = 17
+
+    def meshed(offsets: list[tuple[int, int]]) -> cs.Team:
+        there = [(x, y) for x in range(side) for y in range(side)]
+        links = [((x, y), (x + u, y + v)) for x, y in there for u, v in offsets if (x + u, y + v) in set(there)]
+        near = {at: [cs.near(f"a{x}-{y}", 2) for (x, y), other in links if other == at] for at in there}
+        return cs.Team([cs.Agent(f"a{x}-{y}", near[x, y]) for x, y in there])
+
+    assert why_admm(meshed([(1, 0), (0, 1)]), "local") is None
+    assert "more than 250 agents with more than 3 links" in str(why_admm(meshed([(1, 0), (0, 1), (1, 1), (2, 1)]), "local"))

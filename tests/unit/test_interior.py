@@ -19,8 +19,9 @@ from consat.problem.objective import Objective
 from consat.problem.units import scale
 from consat.protocols.interior_point import InteriorPoint
 from consat.protocols.local.interior import Interior, Memory, route_of
-from consat.protocols.local.interior.algebra import LOOPED, gram, reduced, solve, spread
+from consat.protocols.local.interior.algebra import gram, reduced, spread
 from consat.protocols.local.interior.prediction import observed, predicted
+from consat.protocols.local.lanewise import LOOPED, eigen, solve
 from tests.unit.teams import MARGINS, case
 
 
@@ -52,6 +53,31 @@ def test_a_gram_matrix_is_the_same_however_large():
     weight, vectors = random.uniform(size=(3, 2)), random.normal(size=(3, 4, 2))
     expected = np.einsum("ma,mia,mja->ija", weight, vectors, vectors)
     assert np.allclose(gram(jnp.asarray(weight), jnp.asarray(vectors)), expected)
+
+
+@float64
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 7, 12, LOOPED + 5])
+def test_eigenvectors_of_many_matrices_at_once(size: int) -> None:
+    """Also zero, multiples of the identity, rank one, and entries of very different size."""
+    random = np.random.default_rng(size)
+    matrices = random.normal(size=(9, size, size))
+    matrices = matrices + np.swapaxes(matrices, 1, 2)
+    matrices[:5] = [
+        np.zeros((size, size)),
+        3 * np.eye(size),
+        np.ones((size, size)),
+        np.diag(10.0 ** np.linspace(-12, 12, size)),
+        matrices[0] * 1e250,
+    ]
+    values, vectors = (np.asarray(each) for each in eigen(jnp.asarray(np.moveaxis(matrices, 0, -1))))
+    for k, matrix in enumerate(matrices):
+        scale = max(np.abs(matrix).max(), 1e-300)
+        np.testing.assert_allclose(vectors[..., k].T @ vectors[..., k], np.eye(size), atol=1e-13)
+        np.testing.assert_allclose((vectors[..., k] * values[:, k]) @ vectors[..., k].T / scale, matrix / scale, atol=1e-13)
+        np.testing.assert_allclose(np.sort(values[:, k]) / scale, np.linalg.eigvalsh(matrix) / scale, atol=1e-13)
+        alone = eigen(jnp.asarray(matrix[..., None]))
+        assert np.array_equal(alone[0][:, 0], values[:, k]), "whatever else is in the batch"
+        assert np.array_equal(alone[1][..., 0], vectors[..., k])
 
 
 @pytest.mark.parametrize("size", [6, LOOPED + 4])

@@ -14,8 +14,9 @@ from consat.numerics import float64
 from consat.problem.objective import Nu
 from consat.protocols.estimates import Estimates
 from consat.protocols.local import proximal as prox
+from consat.protocols.local.lanewise import LOOPED
 from consat.protocols.local.proximal import batches
-from consat.protocols.local.proximal.hessians import LOOPED, UNROLLED, Alike, Dense, solve_symmetric
+from consat.protocols.local.proximal.hessians import UNROLLED, Alike, Dense, solve_symmetric
 from consat.protocols.local.proximal.lanes import variance
 
 EXACT = prox.Precision(1e-10)

@@ -14,6 +14,11 @@ from consat.numerics import once
 from consat.problem.constraints.curvature import hessians
 from consat.problem.family import Family
 
+LOOPED = 16
+"""Largest number of unknowns for elimination by a loop over the pivots; larger systems are split into halves recursively."""
+SWEEPS = 30
+"""Largest number of sweeps over all pairs in `eigen`; 5 to 10 are usual."""
+
 
 def along(function: Callable[..., Any]) -> Callable[..., Any]:
     """Vectorise a function of one constraint of one agent over the constraints (first axis) and the agents (last axis)."""
@@ -54,6 +59,89 @@ def eliminated(matrix: Array, right: Array) -> tuple[Array, Array]:
     start = jnp.concatenate([matrix, right], axis=1), jnp.ones(matrix.shape[-1], bool)
     whole, positive = jax.lax.fori_loop(0, size, eliminate, start)
     return whole[:, size:], positive
+
+
+def product(left: Array, right: Array) -> Array:
+    """Matrix product in every lane: (i, k, A), (k, j, A) → (i, j, A)."""
+    found = jnp.matmul(jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0))
+    return jnp.moveaxis(found, 0, -1)
+
+
+def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
+    """Solve a symmetric positive definite system in every lane.
+
+    Args:
+        matrix: (N, N, A) matrices.
+        right: (N, r, A) right-hand sides.
+
+    Returns:
+        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
+    """
+    size = len(matrix)
+    if size > LOOPED:  # block elimination with two halves
+        half = size // 2
+        corner = jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
+        found, first = solve(matrix[:half, :half], corner)
+        filled = product(matrix[half:, :half], found)
+        rest = size - half
+        below, second = solve(matrix[half:, half:] - filled[:, :rest], right[half:] - filled[:, rest:])
+        above = found[:, rest:] - product(found[:, :rest], below)
+        return jnp.concatenate([above, below]), first & second
+    return eliminated(matrix, right)
+
+
+def eigen(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues and eigenvectors of a symmetric matrix in every lane, by Jacobi rotations of disjoint pairs (Brent and Luk 1985, "The
+    solution of singular-value and symmetric eigenvalue problems on multiprocessor arrays", round-robin order).
+
+    LAPACK is not used in compiled programs: on a CPU, two calls at once wait for threads of the pool that they themselves occupy.
+
+    Args:
+        matrix: (N, N, A) symmetric, finite.
+
+    Returns:
+        (N, A) eigenvalues, unsorted, and (N, N, A) the eigenvectors, one in each column.
+    """
+    size = len(matrix)
+    odd = size % 2
+    scale = jnp.max(jnp.abs(matrix), axis=(0, 1), initial=0.0)
+    whole = jnp.pad(matrix / jnp.where(scale > 0, scale, 1.0)[None, None], ((0, odd), (0, odd), (0, 0)))
+    top, bottom = np.arange(0, size, 2), np.arange(1, size + odd, 2)
+    order = np.arange(size + odd)
+    if len(top) > 1:  # the first one stays, the others go around
+        order = np.stack([[0, bottom[0], *top[1:-1]], [*bottom[1:], top[-1]]], axis=1).ravel()
+    apart = ~np.eye(size + odd, dtype=bool)[:, :, None]
+    small = 8.0 * jnp.finfo(matrix.dtype).eps
+
+    def rotate(_: Array, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        whole, vectors, done = at
+        diagonal, beside = jnp.diagonal(whole).T, jnp.stack([whole[k, k + 1] for k in range(0, size, 2)])
+        tau = (diagonal[1::2] - diagonal[::2]) / (2.0 * jnp.where(beside == 0, 1.0, beside))
+        tangent = jnp.where(tau < 0, -1.0, 1.0) / (jnp.abs(tau) + jnp.sqrt(1.0 + tau**2))
+        tangent = jnp.where((beside == 0) | done[None], 0.0, tangent)
+        cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
+        sine = tangent * cosine
+
+        def turned(rows: Array) -> Array:
+            p, q = rows[::2], rows[1::2]
+            c, s = cosine[:, None], sine[:, None]
+            return jnp.stack([c * p - s * q, s * p + c * q], axis=1).reshape(rows.shape)[order]
+
+        whole = jnp.swapaxes(turned(jnp.swapaxes(turned(whole), 0, 1)), 0, 1)
+        return whole, turned(vectors), done
+
+    def settled(whole: Array) -> Array:
+        return jnp.max(jnp.where(apart, jnp.abs(whole), 0.0), axis=(0, 1)) <= small
+
+    def sweep(at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        whole, vectors, done, number = at
+        whole, vectors, _ = jax.lax.fori_loop(0, size + odd - 1, rotate, (whole, vectors, done))
+        return whole, vectors, settled(whole), number + 1
+
+    vectors = jnp.broadcast_to(jnp.eye(size + odd)[:, :, None], whole.shape)
+    start = whole, vectors, settled(whole), jnp.zeros((), int)
+    whole, vectors, *_ = jax.lax.while_loop(lambda at: ~jnp.all(at[2]) & (at[3] < SWEEPS), sweep, start)
+    return jnp.diagonal(whole).T[:size] * scale[None], jnp.swapaxes(vectors, 0, 1)[:size, :size]
 
 
 def bend_of(family: Family, dimension: int) -> np.ndarray | None:

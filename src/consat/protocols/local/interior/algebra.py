@@ -5,16 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from consat.protocols.local.lanewise import eliminated
-
-LOOPED = 16
-"""Largest number of unknowns for elimination by a loop over the pivots; larger systems are split into halves recursively."""
-
-
-def product(left: Array, right: Array) -> Array:
-    """Matrix product in every lane: (i, k, A), (k, j, A) → (i, j, A)."""
-    found = jnp.matmul(jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0))
-    return jnp.moveaxis(found, 0, -1)
+from consat.protocols.local.lanewise import LOOPED, product, solve
 
 
 def times(matrix: Array, vector: Array) -> Array:
@@ -29,29 +20,6 @@ def gram(weight: Array, vectors: Array) -> Array:
         return jnp.sum(weighted[:, :, None] * vectors[:, None], axis=0)
     first = jnp.moveaxis(vectors, -1, 0)
     return jnp.moveaxis(jnp.einsum("aki,akj->aij", jnp.moveaxis(weighted, -1, 0), first), 0, -1)
-
-
-def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """Solve a symmetric positive definite system in every lane.
-
-    Args:
-        matrix: (N, N, A) matrices.
-        right: (N, r, A) right-hand sides.
-
-    Returns:
-        (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
-    """
-    size = len(matrix)
-    if size > LOOPED:  # block elimination with two halves
-        half = size // 2
-        corner = jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
-        found, first = solve(matrix[:half, :half], corner)
-        filled = product(matrix[half:, :half], found)
-        rest = size - half
-        below, second = solve(matrix[half:, half:] - filled[:, :rest], right[half:] - filled[:, rest:])
-        above = found[:, rest:] - product(found[:, :rest], below)
-        return jnp.concatenate([above, below]), first & second
-    return eliminated(matrix, right)
 
 
 def spread(matrix: Array, vector: Array, shared: Array, size: int) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from jax import Array
 from consat.numerics import on_device
 from consat.problem.units import Scale
 from consat.protocols.local.interior.layout import Batch, Form, Kind
-from consat.protocols.local.lanewise import along, arguments
+from consat.protocols.local.lanewise import along, arguments, eigen
 
 
 class Units(NamedTuple):
@@ -141,7 +141,10 @@ class Lanes:
                 rank, values, found = 0, jnp.zeros((m, 0, count)), jnp.zeros((m, 0, arity, d, count))
             else:
                 rank = arity * d
-                values, found = along(_bend(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)
+                minus = along(_minus_hessian(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)  # (m, N, N, A)
+                eigenvalues, eigenvectors = eigen(jnp.moveaxis(minus, 0, -2).reshape(rank, rank, m * count))
+                values = jnp.moveaxis(jnp.maximum(eigenvalues, 0.0).reshape(rank, m, count), 1, 0)
+                found = eigenvectors.T.reshape(m, count, rank, arity, d).transpose(0, 2, 3, 4, 1)
             if rank:
                 rows = jnp.repeat(kind.slots, rank, axis=0, total_repeat_length=m * rank)
                 which += [done + k for k in range(m) for _ in range(rank)]
@@ -199,14 +202,12 @@ def _at(psi: Any) -> Any:
     return lambda x, p: psi(*x, **p)
 
 
-def _bend(psi: Any, arity: int, d: int) -> Any:
-    """Function of positions, (arity, d), and parameters that returns the eigenvalues of −∇²ψ, clipped at 0, (R,), and the eigenvectors,
-    (R, arity, d)."""
+def _minus_hessian(psi: Any, arity: int, d: int) -> Any:
+    """Function of positions, (arity, d), and parameters that returns −∇²ψ, (arity·d, arity·d); 0 where it is not finite."""
 
-    def one(x: Array, p: dict[str, Array]) -> tuple[Array, Array]:
+    def one(x: Array, p: dict[str, Array]) -> Array:
         hessian = -jax.hessian(_at(psi))(x, p).reshape(arity * d, arity * d)
-        values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(hessian).all(), 0.5 * (hessian + hessian.T), 0.0))
-        return jnp.maximum(values, 0.0), vectors.T.reshape(arity * d, arity, d)
+        return jnp.where(jnp.isfinite(hessian).all(), 0.5 * (hessian + hessian.T), 0.0)
 
     return one
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from consat.protocols.local.interior.algebra import gram, reduced, solve, spread, times
+from consat.protocols.local.interior.algebra import gram, reduced, spread, times
 from consat.protocols.local.interior.lanes import Here, Lanes, number
+from consat.protocols.local.lanewise import solve
 
 REGION = 10.0
 """Radius R of the region for which a proof holds, in multiples of the team's reach around its centre; `Units.extent` is added to it."""

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from consat.protocols.local.interior.algebra import gram, reduced, solve, spread, times
+from consat.protocols.local.interior.algebra import gram, reduced, spread, times
 from consat.protocols.local.interior.lanes import Here, Lanes, number
 from consat.protocols.local.interior.prediction import observed, predicted
 from consat.protocols.local.interior.proof import Proof, prove
 from consat.protocols.local.interior.state import Gains, Memory, centered, mean
+from consat.protocols.local.lanewise import solve
 
 SHORTEST = 1e-9
 """Smallest step length of the line search; below it the step is not taken."""

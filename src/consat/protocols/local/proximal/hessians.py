@@ -11,12 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from consat.numerics import add_up
-from consat.protocols.local.lanewise import eliminated
+from consat.protocols.local.lanewise import eigen, solve
 
 UNROLLED = 8
 """Largest number of unknowns for elimination with unrolled pivots."""
-LOOPED = 24
-"""Largest number of unknowns for elimination by a loop over the pivots; larger systems use LAPACK."""
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -63,9 +61,9 @@ class Dense(NamedTuple):
         def mended() -> Array:
             if self.safe is not None:
                 return solve_symmetric(diagonal + multiplier[None, None] * self.safe, right)[0]
-            values, vectors = jnp.linalg.eigh(jnp.moveaxis(matrix, -1, 0))
-            values = jnp.maximum(jnp.abs(values), jnp.min(kappa, axis=0)[:, None])
-            return jnp.einsum("aij,aj,akj,kra->ira", vectors, 1.0 / values, vectors, right)
+            values, vectors = eigen(jnp.where(jnp.isfinite(matrix), matrix, 0.0))
+            values = jnp.maximum(jnp.abs(values), jnp.min(kappa, axis=0)[None])
+            return jnp.einsum("ija,ja,kja,kra->ira", vectors, 1.0 / values, vectors, right)
 
         return jnp.where(positive[None, None], found, jax.lax.cond(jnp.all(positive), lambda: found, mended))
 
@@ -123,11 +121,7 @@ def solve_symmetric(matrix: Array, right: Array) -> tuple[Array, Array]:
         (N, r, A) the solutions, and (A,) whether the matrix is positive definite.
     """
     size = len(matrix)
-    if size > LOOPED:
-        first = jnp.moveaxis(matrix, -1, 0)
-        found = jnp.moveaxis(jnp.linalg.solve(first, jnp.moveaxis(right, -1, 0)), 0, -1)
-        return found, jnp.isfinite(jnp.linalg.cholesky(first)).all(axis=(1, 2))  # NaN where there is no factor
-    return eliminated(matrix, right) if size > UNROLLED else _unrolled(jnp.concatenate([matrix, right], axis=1), size)
+    return solve(matrix, right) if size > UNROLLED else _unrolled(jnp.concatenate([matrix, right], axis=1), size)
 
 
 def _unrolled(whole: Array, size: int) -> tuple[Array, Array]:
