@@ -52,6 +52,11 @@ class Shape:
     convex: Bools
     hessians: tuple[Floats | None, ...]
 
+    @property
+    def wild(self) -> bool:
+        """Whether some ψ is neither concave nor convex nor quadratic."""
+        return not (self.concave | self.convex | self.quadratic).all()
+
 
 @functools.lru_cache(maxsize=16)
 def shape_of(team: Team) -> Shape:

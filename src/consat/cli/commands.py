@@ -162,7 +162,7 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
               help="Integrates the bodies of robots: {}; by default the robots' own models do.")  # fmt: skip
 @sends_option
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
-@click.option("--restarts", type=click.IntRange(min=1), default=1, metavar="K", help="Run from K starts, and tell of the best.")
+@click.option("--restarts", type=click.IntRange(min=1), metavar="K", help="Run from K starts, and tell of the best.")
 @out_option
 @force_option
 @click.option("--every", type=click.IntRange(min=1), default=1, metavar="K", help="Record each K-th round, or sample of a flow.")

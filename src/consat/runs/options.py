@@ -64,7 +64,7 @@ class Options:
     wind: tuple[float, ...] = ()
     noise: float = 0.0
     simulator: str | None = None
-    restarts: int = 1
+    restarts: int | None = None
     burst: tuple[float, float] | None = None
     sends: Sends = "all"
 
@@ -110,7 +110,7 @@ class Options:
             name: getattr(self, name)
             for name in ("rounds", "loss", "sleep", "burst", "rate", "speed", "robots", "wind", "noise", "simulator")
         }
-        given |= {"restarts": self.restarts - 1, "sends": self.events}
+        given |= {"restarts": self.restarts not in (None, 1), "sends": self.events}
         if wrong := [name for name, value in given.items() if value]:
             message = f"protocol {kind} flows in continuous time; use until; {', '.join(wrong)} means nothing to it"
             raise InvalidSettings(message)
@@ -141,9 +141,9 @@ class Options:
 
     def pace(self, kind: str, team: Team) -> Pace:
         """Number and timing of the rounds for the protocol `kind`. Raises: InvalidSettings: the options contradict each other."""
-        if self.restarts < 1:
+        if self.restarts is not None and self.restarts < 1:
             raise InvalidSettings(f"restarts is {self.restarts}, but must be at least 1: from how many starts to run")
-        if self.restarts > 1 and (self.rate is not None or team.moves or self.robots is not None):
+        if (self.restarts or 1) > 1 and (self.rate is not None or team.moves or self.robots is not None):
             raise InvalidSettings(
                 "restarts are of agents that are where they want to be; rate, robots and moving constraints mean nothing there"
             )

@@ -86,7 +86,7 @@ def why_admm(team: Team, layout: Layout) -> str | None:
     if layout == "full" and team.count > FULL:
         return f"there are more than {FULL} agents of which everybody holds everything, and messages would be too wide"
     shape = shape_of(team)
-    if not shape.concave.all() and (shape.concave | shape.convex | shape.quadratic).all() and len(team.links) >= team.count:
+    if not shape.concave.all() and not shape.wild and len(team.links) >= team.count:
         return "some constraints keep agents apart and the links form loops, where admm takes fewer rounds"
     if team.count > SEVERAL and len(team.links) > DENSE * team.count:
         return f"there are more than {SEVERAL} agents with more than {DENSE:g} links for each, where admm takes fewer rounds"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
+from consat.certify.quadratics import shape_of
 from consat.engine.batch import Case, Lane, Then, simulate_batch
 from consat.engine.rules import PATIENCE, Rules, longest_hold, stillness, turn_after
 from consat.engine.world import World, world_of
@@ -19,6 +22,10 @@ from consat.protocols.estimates import Estimates
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared
 from consat.settings import Settings, Start
+
+ELSEWHERE, BRIEFLY = 5, 300
+"""Number of starts that a run tries by itself, and number of rounds for each; see `looks_elsewhere`. Of random teams (`benchmarks/hunt.py`)
+that are satisfied, most are so within 100 rounds."""
 
 
 def case_of(ready: Prepared, faults: Faults, options: Options) -> Case:
@@ -49,21 +56,30 @@ def case_of(ready: Prepared, faults: Faults, options: Options) -> Case:
     return Case(along, gains, dataclasses.replace(rules, turn=turn_after(along)), Then(ready.copies, then, after))
 
 
+def looks_elsewhere(team: Team, options: Options, summary: Mapping[str, Any]) -> bool:
+    """Whether a run that was not told how many starts to try tries others: it has not satisfied a team with ψ that are neither concave nor
+    convex nor quadratic, and nothing but the seed determines where the agents are at the start. `summary`: of the first run."""
+    simple = options.restarts is None and options.stop is None and options.rounds is None and jax.process_count() == 1
+    still = options.rate is None and options.robots is None and not team.moves
+    return simple and still and summary["status"] == "not-converged" and shape_of(team).wild
+
+
 @float64
-def best_start(team: Team, settings: Settings, options: Options) -> dict[str, Any]:
+def best_start(team: Team, settings: Settings, options: Options, count: int) -> dict[str, Any]:
     """Find the start from which a team ends with the largest margin. The result is not proven to be the best.
 
     Args:
         team: the team.
         settings: resolved settings; their seed is the first one.
-        options: options that determine stop rules, loss, sleep, and the number of consecutive seeds.
+        options: options that determine stop rules, loss and sleep.
+        count: number of consecutive seeds.
 
     Returns:
         The entry ``restarts`` of ``consat run --json``: number of seeds, best seed (the first of equals), number of runs that satisfied
         every constraint, and the last margin of each run, null where it is not finite.
     """
     ready, start = Prepared.of(team, settings), settings.start
-    count, faults = options.restarts, Faults(options.loss, options.sleep, burst=options.burst)
+    faults = Faults(options.loss, options.sleep, burst=options.burst)
     case = case_of(ready, faults, options)
     seeds = range(start.seed, start.seed + count)
     lanes = [Lane(case, ready.first(Start(box=start.box, seed=seed)), seed) for seed in seeds]

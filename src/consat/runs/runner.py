@@ -26,7 +26,7 @@ from consat.results.trace import Trace
 from consat.runs.advice import around_loops
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, named, robots_of, scenario_of, settings_of, told, with_auxiliary
-from consat.runs.restarting import best_start
+from consat.runs.restarting import BRIEFLY, ELSEWHERE, best_start, looks_elsewhere
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
 from consat.settings import Layout, Sends, Settings, Smoothing, Stop
@@ -55,7 +55,7 @@ def run(
     simulator: str | None = None,
     sends: Sends = "all",
     auxiliary: float | None = None,
-    restarts: int = 1,
+    restarts: int | None = None,
     record: bool | None = None,
     agents: Who = None,
     every: int = 1,
@@ -95,7 +95,8 @@ def run(
         sends: ``all``: every agent sends in every round; ``events``: only what is news, see `consat.protocols.sending`. For rounds.
         auxiliary: radius, length, of a constraint that is added to every agent: to stay within it of the team's centre (paper, remark 2).
         restarts: number of starts, with `seed` and the seeds after it, which run as one computation. The result is that of the start whose
-            run ends with the largest margin. For rounds.
+            run ends with the largest margin. By default it is 1, but 5 starts are tried if the first does not satisfy a team with ψ that
+            are neither concave nor convex nor quadratic, unless `rounds` or `stop` is given. For rounds.
         record: whether to record all estimates and integral states; by default only while they are few.
         agents: agents to record: ids, ``all`` or ``none``; by default all, but a sample of 1,000 of teams above 10,000.
         every: record one round, or one sample of a flow, in `every`.
@@ -173,24 +174,32 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
     kind = str(settings.protocol.kind)
     if jax.process_count() > 1:
         _require_simple(kind, team, options, files is not None and files.checkpoints(about) is not None)
-    more = told(team, settings.protocol.model_copy(update={"kind": named(scenario.settings, options)})) | {"restarts": None}
+    more = told(team, settings.protocol.model_copy(update={"kind": named(scenario.settings, options)}))
     keep = _Keep(options, files, about)
     how: dict[str, Any] = {"stop": options.stop_for(kind), "progress": progress}
     if kind in FLOWS:
         options.require_flow(kind, team)
-        return _run(scenario, settings, full, keep, more, functools.partial(_flow, until=options.until, **how))
-    pace, faults = options.pace(kind, team), options.faults(settings.start.seed)
-    how |= {"events": options.events}
-    if options.restarts > 1:
-        found = best_start(team, settings, options)
-        settings = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": found["seed"]})})
-        faults, more = options.faults(found["seed"]), more | {"restarts": found}
-    return _run(scenario, settings, full, keep, more, functools.partial(_rounds, faults=faults, **pace._asdict(), **how))
+        return _run(scenario, settings, full, keep, more | {"restarts": None}, functools.partial(_flow, until=options.until, **how))
+    how |= options.pace(kind, team)._asdict() | {"events": options.events}
+
+    def run_from(seed: int, found: Mapping[str, Any] | None) -> Result:
+        there = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": seed})})
+        return _run(scenario, there, full, keep, more | {"restarts": found}, functools.partial(_rounds, faults=options.faults(seed), **how))
+
+    if options.restarts is not None and options.restarts > 1:
+        found = best_start(team, settings, options, options.restarts)
+        return run_from(found["seed"], found)
+    result = run_from(settings.start.seed, None)
+    if (files is None or files.checkpoints(about) is None) and looks_elsewhere(team, options, result.summary):
+        found = best_start(team, settings, dataclasses.replace(options, rounds=BRIEFLY, stop="satisfied"), ELSEWHERE)
+        if found["satisfied"]:
+            return run_from(found["seed"], found)
+    return result
 
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """Check that several processes can run the team. Raises: InvalidSettings: they cannot."""
-    if options.restarts > 1 or options.robots is not None or options.burst is not None or options.events:
+    if (options.restarts or 1) > 1 or options.robots is not None or options.burst is not None or options.events:
         message = "several processes run points, from one start, lose messages one by one, and send all; use one process for more"
         raise InvalidSettings(message)
     if kind in FLOWS or checkpoints:
