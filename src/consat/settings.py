@@ -85,7 +85,7 @@ class Start(Model):
 
 
 Layout = Literal["local", "full"]
-"""Which positions an agent holds estimates of: those that it needs, or all (as in the paper)."""
+"""Which positions an agent holds estimates of."""
 Sends = Literal["all", "events"]
 """When agents send: in every round, or only news."""
 Stop = Literal["satisfied", "converged", "never"]
@@ -98,7 +98,7 @@ class ProtocolSettings(Model):
 
     Attributes:
         kind: name of the protocol; None for the default.
-        estimates: see `Layout`.
+        estimates: which positions an agent holds estimates of: ``local`` those that it needs, ``full`` all (as in the paper).
         k1: gain of a flow on the gradient.
         k2: gain of a flow on the disagreement between estimates.
         penalty: initial ρ of admm, in 1/length².
