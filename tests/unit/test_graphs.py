@@ -174,7 +174,7 @@ def test_full_layout_holds_only_the_own_cluster() -> None:
 
 
 def test_unknown_layout_is_refused() -> None:
-    with pytest.raises(cs.InvalidSettings, match="must be one of full, local"):
+    with pytest.raises(cs.InvalidSettings, match="must be one of local, full"):
         Estimates.of(example(), "half")  # type: ignore[arg-type]
 
 

@@ -1,4 +1,5 @@
-"""Transfer of a protocol's state to a team of another structure, after agents, constraints or links were added or removed.
+"""Changes of a state between two rounds: its transfer to a team of another structure, after agents, constraints or links were added or
+removed, and bodies that are put elsewhere.
 
 Every array of the state has one row for each copy, constraint, neighbour, end of a link, or agent. A row whose name existed before keeps
 its values; a new row has the values of an initial state.
@@ -15,9 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.engine.bodies import Driven
-from consat.engine.round import by_axis
+from consat.engine.round import Now, by_axis
+from consat.engine.world import World
+from consat.numerics import on_device
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
+from consat.protocols.interior_point import InteriorState
 from consat.protocols.local.interior import Shared
 
 if TYPE_CHECKING:
@@ -135,3 +139,24 @@ def robot_placed(model: Model[Any], state: Any, i: int, place: np.ndarray) -> An
 
 def _row_taken(state: Any, fresh: Any, i: int) -> Any:
     return jax.tree.map(lambda a, b: jnp.asarray(a).at[i].set(jnp.asarray(b)[i]), state, fresh)
+
+
+@jax.jit
+def _body_moved(body: Any, x: Any, row: Any, i: Any, value: Any) -> tuple[Any, Any]:
+    return body.at[i].set(value), x.at[row].set(value)
+
+
+def placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> Now:
+    """Copy of the state with the body of agent `i` at `value`, (d,). `own`: whether the agent's own estimate is set, too."""
+    row = world.own[i]
+    body, x = _body_moved(now.body, now.state.x, row, on_device(i), on_device(value))
+    state = now.state
+    if own:
+        state = state._replace(memory=state.memory._replace(y=x)) if isinstance(state, InteriorState) else state._replace(x=x)
+    heard = now.heard
+    if heard is not None:
+        heard = heard._replace(position=heard.position.at[row].set(on_device(value)))
+    robots = now.robots
+    if robots is not None and world.drive is not None:
+        robots = robots._replace(state=robot_placed(world.drive.model, robots.state, i, np.asarray(body)))
+    return now._replace(state=state, body=body, heard=heard, robots=robots)

@@ -17,6 +17,7 @@ from consat.engine.round import SATISFIED, Now, Seen, Sent, begin, one_round, se
 from consat.engine.violations import violated
 from consat.engine.world import World
 from consat.numerics import on_device, quick_compilation, thorough_compilation
+from consat.problem.objective import Objective
 from consat.protocols import Rounds
 
 if TYPE_CHECKING:
@@ -317,9 +318,19 @@ class OneProcess:
     def positions(self, state: Now) -> np.ndarray:
         return np.array(state.body)
 
+    def margins(self, state: Now, number: int) -> np.ndarray:
+        """(N,) margins of the agents where their bodies are, in round `number`."""
+        return np.asarray(_agent_margins(self.world, state, float(number)))
+
     def agree(self, stop: bool) -> bool:
         return stop
 
     def look(self, state: Now, number: int) -> Kept:
         kept = _compiled(self._large)[2](self.world, self._chosen, state, on_device(float(number)))
         return Kept(*map(np.array, kept))
+
+
+@jax.jit
+def _agent_margins(world: World, now: Now, round_: Any) -> Any:
+    observer: Objective = world.at(on_device(round_)).observer
+    return observer.agent_margins(now.body)

@@ -182,6 +182,27 @@ class Memory:
         """All recorded steps."""
         return self._whole()
 
+    def renamed(self, before: Sequence[str], after: Sequence[str]) -> Memory:
+        """Copy for other agents. Positions and margins of agents that were not in it are NaN.
+
+        Args:
+            before: ids of its agents.
+            after: ids of the new agents.
+        """
+        rows, place = self._whole(), {agent: k for k, agent in enumerate(before)}
+        where = np.array([place.get(agent, -1) for agent in after])
+        there = where >= 0
+
+        def arranged(values: np.ndarray) -> np.ndarray:
+            found = np.full((len(values), len(after), *values.shape[2:]), np.nan)
+            found[:, there] = values[:, where[there]]
+            return found
+
+        fresh = Memory(self.every)
+        heading = None if rows.heading is None else arranged(rows.heading)
+        fresh.append(rows._replace(position=arranged(rows.position), agent_margin=arranged(rows.agent_margin), heading=heading))
+        return fresh
+
 
 class Log:
     """Record in a file, so that memory use does not grow with the run; `steps` reads it back.

@@ -32,6 +32,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from consat.protocols.base import Known, Solver
@@ -54,6 +55,21 @@ class InteriorState(NamedTuple):
     def x(self) -> Array:
         """(rows, d) its estimates."""
         return self.memory.y
+
+    def changed(self, agents: list[int]) -> InteriorState:
+        """State of a team after constraints of these agents have changed: their counts of changes are raised and their bounds dropped, so
+        that all proofs restart."""
+        changes, bound = np.array(self.memory.changes), np.array(self.memory.bound)
+        changes[agents] += 1.0
+        bound[agents] = np.inf
+        # NumPy arrays are transferred with the next call; a separate transfer to the device takes a sixth of a small round
+        return self._replace(memory=self.memory._replace(changes=changes, bound=bound))  # type: ignore[arg-type]
+
+    def begun_anew(self) -> InteriorState:
+        """State for a team of another structure: all counts of changes are raised and all bounds dropped."""
+        memory = self.memory
+        changes = jnp.zeros_like(memory.changes) + jnp.max(memory.changes, initial=0.0) + 1.0
+        return self._replace(memory=memory._replace(changes=changes, bound=jnp.full_like(memory.bound, jnp.inf)))
 
 
 @dataclass(frozen=True)

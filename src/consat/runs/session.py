@@ -11,21 +11,20 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.certify.certificate import Verdict, judged
 from consat.certify.reasons import explain
 from consat.engine.bodies import Body
-from consat.engine.carry import Names, carried, robot_placed, robots_carried
+from consat.engine.carry import Names, carried, placed, robots_carried
 from consat.engine.chunks import CHUNK, Chunk, OneProcess
 from consat.engine.live import Live
 from consat.engine.recording import Choice, Memory, Rows, velocities
 from consat.engine.round import Now
 from consat.engine.rounds import driven
 from consat.engine.tally import Tally, known_of
-from consat.engine.world import World, world_of
+from consat.engine.world import world_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam
 from consat.numerics import float64, on_device
 from consat.problem import structure
@@ -33,7 +32,6 @@ from consat.problem.agent import Agent
 from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, place_of
 from consat.problem.constraints.library import ADJUSTABLE, farthest
 from consat.problem.graphs import require_connected
-from consat.problem.objective import Objective
 from consat.problem.parameters import vector
 from consat.problem.team import Team
 from consat.problem.units import scale
@@ -281,7 +279,7 @@ class Session:
         value = vector(position, self.dimension, ("position",), "position", f"agent {agent!r}", faults)
         if value is None:
             raise InvalidTeam(faults)
-        self._state = _placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
+        self._state = placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
         self._positions = np.asarray(self._state.body)
         self._own_margins, self._stepped = None, False
         return self
@@ -456,7 +454,7 @@ class Session:
     def _margins(self) -> np.ndarray:
         """(N,) margins of the agents where they are, of the constraints as they are; computed anew after a change."""
         if self._own_margins is None:
-            self._own_margins = np.asarray(_agent_margins(self._engine.carrier.world, self._state, float(self.round)))
+            self._own_margins = self._engine.carrier.margins(self._state, self.round)
         return self._own_margins
 
     def _body_of(self, team: Team) -> Body:
@@ -495,9 +493,10 @@ class Session:
         robots = state.robots
         if robots is not None and self._state.robots is not None and body.drive is not None:
             robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
-        state = state._replace(state=_begun_anew(inner), body=on_device(place), key=self._state.key, robots=robots)
+        inner = inner.begun_anew() if isinstance(inner, InteriorState) else inner
+        state = state._replace(state=inner, body=on_device(place), key=self._state.key, robots=robots)
         # the session is modified only below, where no error can be raised
-        self._record = _renamed(self._record, names[0].agent, names[1].agent)
+        self._record = self._record.renamed(names[0].agent, names[1].agent)
         self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
         self._engine, self._state, self._positions, self._body = engine, state, place, body
         self._mark_change()
@@ -548,14 +547,8 @@ class Session:
     def _note_changes(self, owners: Iterable[int]) -> None:
         """Raise the count of changes of the agents whose constraints have changed, and drop their bounds, so that all proofs restart."""
         inner = self._state.state
-        if not isinstance(inner, InteriorState):
-            return
-        changes, bound = np.array(inner.memory.changes), np.array(inner.memory.bound)
-        changes[list(owners)] += 1.0
-        bound[list(owners)] = np.inf
-        # NumPy arrays are transferred with the next call; a separate transfer to the device takes a sixth of a small round
-        memory = inner.memory._replace(changes=changes, bound=bound)  # type: ignore[arg-type]
-        self._state = self._state._replace(state=inner._replace(memory=memory))
+        if isinstance(inner, InteriorState):
+            self._state = self._state._replace(state=inner.changed(list(owners)))
 
 
 @float64
@@ -564,62 +557,3 @@ def assessed(team: Team) -> Assessment:
     best, found = judged(team)
     lower, upper = (None if value is None or not np.isfinite(value) else float(value) for value in (found.lower, found.upper))
     return Assessment(found.verdict, (lower, upper), explain(team, best), best.positions)
-
-
-def _begun_anew(state: Any) -> Any:
-    """State for a team of another structure: raises the count of changes and drops all bounds, which are not valid any more."""
-    if not isinstance(state, InteriorState):
-        return state
-    memory = state.memory
-    changes = jnp.zeros_like(memory.changes) + jnp.max(memory.changes, initial=0.0) + 1.0
-    return state._replace(memory=memory._replace(changes=changes, bound=jnp.full_like(memory.bound, jnp.inf)))
-
-
-@jax.jit
-def _body_moved(body: Any, x: Any, row: Any, i: Any, value: Any) -> tuple[Any, Any]:
-    return body.at[i].set(value), x.at[row].set(value)
-
-
-def _placed(now: Now, world: World, i: int, value: np.ndarray, *, own: bool) -> Now:
-    """Copy of the state with the body of agent `i` at `value`, (d,). `own`: whether the agent's own estimate is set, too."""
-    row = world.own[i]
-    body, x = _body_moved(now.body, now.state.x, row, on_device(i), on_device(value))
-    state = now.state
-    if own:
-        state = state._replace(memory=state.memory._replace(y=x)) if isinstance(state, InteriorState) else state._replace(x=x)
-    heard = now.heard
-    if heard is not None:
-        heard = heard._replace(position=heard.position.at[row].set(on_device(value)))
-    robots = now.robots
-    if robots is not None and world.drive is not None:
-        robots = robots._replace(state=robot_placed(world.drive.model, robots.state, i, np.asarray(body)))
-    return now._replace(state=state, body=body, heard=heard, robots=robots)
-
-
-@jax.jit
-def _agent_margins(world: World, now: Now, round_: Any) -> Any:
-    observer: Objective = world.at(on_device(round_)).observer
-    return observer.agent_margins(now.body)
-
-
-def _renamed(record: Memory, before: Sequence[str], after: Sequence[str]) -> Memory:
-    """Copy of a record for other agents. Positions and margins of agents that were not in it are NaN.
-
-    Args:
-        record: the record.
-        before: ids of its agents.
-        after: ids of the new agents.
-    """
-    rows, place = record.close(), {agent: k for k, agent in enumerate(before)}
-    where = np.array([place.get(agent, -1) for agent in after])
-    there = where >= 0
-
-    def arranged(values: np.ndarray) -> np.ndarray:
-        found = np.full((len(values), len(after), *values.shape[2:]), np.nan)
-        found[:, there] = values[:, where[there]]
-        return found
-
-    fresh = Memory(record.every)
-    heading = None if rows.heading is None else arranged(rows.heading)
-    fresh.append(rows._replace(position=arranged(rows.position), agent_margin=arranged(rows.agent_margin), heading=heading))
-    return fresh

@@ -104,7 +104,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     began = memory._replace(y=predicted(lanes, memory))
     here = Here.of(lanes, began.y)
     known = jnp.minimum(told, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
-    hold = jnp.where((known > 0) & lanes.bent.any(axis=0), HOLD, 1.0)
+    hold = jnp.where((known > 0) & lanes.bent.any(axis=0) & ~lanes.moves, HOLD, 1.0)
     point = lowered(lanes, here, memory._replace(inertia=hold * memory.inertia), lowest, gains)
     y, level, multiplier, swing, inertia = moved(lanes, here, began, point, theirs, gains)
 
