@@ -141,15 +141,20 @@ def test_the_default_with_loops_goes_by_the_kind_of_what_is_not_concave() -> Non
         assert cs.run(_three(psi, *plain), rounds=1).summary["protocol"] == protocol, psi
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_a_model_that_holds_only_nearby_is_not_relied_on_far_away(seed: int) -> None:
-    """Exponentials and poles: whole steps lead to where ψ overflows."""
-    team = _three(
-        "log(1 + exp(2.89 - (a - c)[0])) - 1.4", "(2.4 - 2/norm(b)) * log(1 + exp(4.5 - (b - a)[1])) - 3.6", "tan(norm2(c - a)/4) + 2.8"
-    )
-    result = cs.run(team, protocol="interior-point", start=(-4, 4), seed=seed)
-    assert result.summary["status"] == "satisfied"
-    assert np.abs(result.data["position"].values).max() < 1e3
+def test_a_model_that_holds_only_nearby_is_not_relied_on_far_away() -> None:
+    """Poles, exponentials and high powers: with whole steps the positions end between 1e7 and 1e29, whatever the start."""
+    psis = {
+        "a": ("1/(a - c)[0] + 1.18", "norm(a) - 1.7"),
+        "b": ("sinh(norm2(b - a))/10 - 6.4", "square(8.7 - norm2(0.41*b)) - 30.2"),
+        "c": ("square(8 - norm2(c)/4) - 8", "(0.74*norm2(c))**3 + 7.5 - 2*c[0] - 53.5"),
+    }
+    agents = [cs.Agent(name, [cs.expr(psi) for psi in each]) for name, each in psis.items()]
+    team = cs.Team(agents, [("a", "b"), ("b", "c"), ("a", "c")], dimension=3)
+    for seed in range(3):
+        result = cs.run(team, protocol="interior-point", start=(-4, 4), seed=seed, restarts=1)
+        assert result.summary["status"] == "satisfied"
+        assert result.summary["rounds"] <= 60  # measured: 9 to 19
+        assert np.abs(result.data["position"].values).max() < 100
 
 
 def test_who_only_keeps_apart_is_not_thrown_far_away() -> None:
