@@ -104,6 +104,15 @@ class Options:
             return "never"
         return "converged" if kind == "max-min" else "satisfied"
 
+    @property
+    def many_starts(self) -> bool:
+        """Whether several starts are asked for."""
+        return self.restarts is not None and self.restarts > 1
+
+    def takes_time(self, team: Team) -> bool:
+        """Whether bodies take time to where their agents want them, or constraints move meanwhile."""
+        return self.rate is not None or self.robots is not None or team.moves
+
     def require_flow(self, kind: str, team: Team) -> None:
         """Check the options for a continuous-time protocol. Raises: InvalidSettings: an option applies only to rounds."""
         given = {
@@ -143,7 +152,7 @@ class Options:
         """Number and timing of the rounds for the protocol `kind`. Raises: InvalidSettings: the options contradict each other."""
         if self.restarts is not None and self.restarts < 1:
             raise InvalidSettings(f"restarts is {self.restarts}, but must be at least 1: from how many starts to run")
-        if (self.restarts or 1) > 1 and (self.rate is not None or team.moves or self.robots is not None):
+        if self.many_starts and self.takes_time(team):
             raise InvalidSettings(
                 "restarts are of agents that are where they want to be; rate, robots and moving constraints mean nothing there"
             )

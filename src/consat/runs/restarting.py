@@ -60,8 +60,7 @@ def looks_elsewhere(team: Team, options: Options, summary: Mapping[str, Any]) ->
     """Whether a run that was not told how many starts to try tries others: it has not satisfied a team with ψ that are neither concave nor
     convex nor quadratic, and nothing but the seed determines where the agents are at the start. `summary`: of the first run."""
     simple = options.restarts is None and options.stop is None and options.rounds is None and jax.process_count() == 1
-    still = options.rate is None and options.robots is None and not team.moves
-    return simple and still and summary["status"] == "not-converged" and shape_of(team).wild
+    return simple and not options.takes_time(team) and summary["status"] == "not-converged" and shape_of(team).wild
 
 
 @float64

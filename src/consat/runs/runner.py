@@ -186,7 +186,8 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
         there = settings.model_copy(update={"start": settings.start.model_copy(update={"seed": seed})})
         return _run(scenario, there, full, keep, more | {"restarts": found}, functools.partial(_rounds, faults=options.faults(seed), **how))
 
-    if options.restarts is not None and options.restarts > 1:
+    if options.many_starts:
+        assert options.restarts is not None
         found = best_start(team, settings, options, options.restarts)
         return run_from(found["seed"], found)
     result = run_from(settings.start.seed, None)
@@ -199,7 +200,7 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
 
 def _require_simple(kind: str, team: Team, options: Options, checkpoints: bool) -> None:
     """Check that several processes can run the team. Raises: InvalidSettings: they cannot."""
-    if (options.restarts or 1) > 1 or options.robots is not None or options.burst is not None or options.events:
+    if options.many_starts or options.robots is not None or options.burst is not None or options.events:
         message = "several processes run points, from one start, lose messages one by one, and send all; use one process for more"
         raise InvalidSettings(message)
     if kind in FLOWS or checkpoints:

@@ -113,8 +113,7 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
     apart = ~np.eye(size + odd, dtype=bool)[:, :, None]
     small = 8.0 * jnp.finfo(matrix.dtype).eps
 
-    def rotate(_: Array, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        whole, vectors, done = at
+    def rotate(whole: Array, vectors: Array, done: Array) -> tuple[Array, Array]:
         diagonal, beside = jnp.diagonal(whole).T, jnp.stack([whole[k, k + 1] for k in range(0, size, 2)])
         tau = (diagonal[1::2] - diagonal[::2]) / (2.0 * jnp.where(beside == 0, 1.0, beside))
         tangent = jnp.where(tau < 0, -1.0, 1.0) / (jnp.abs(tau) + jnp.sqrt(1.0 + tau**2))
@@ -128,14 +127,14 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
             return jnp.stack([c * p - s * q, s * p + c * q], axis=1).reshape(rows.shape)[order]
 
         whole = jnp.swapaxes(turned(jnp.swapaxes(turned(whole), 0, 1)), 0, 1)
-        return whole, turned(vectors), done
+        return whole, turned(vectors)
 
     def settled(whole: Array) -> Array:
         return jnp.max(jnp.where(apart, jnp.abs(whole), 0.0), axis=(0, 1)) <= small
 
     def sweep(at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         whole, vectors, done, number = at
-        whole, vectors, _ = jax.lax.fori_loop(0, size + odd - 1, rotate, (whole, vectors, done))
+        whole, vectors = jax.lax.fori_loop(0, size + odd - 1, lambda _, now: rotate(now[0], now[1], done), (whole, vectors))
         return whole, vectors, settled(whole), number + 1
 
     vectors = jnp.broadcast_to(jnp.eye(size + odd)[:, :, None], whole.shape)

@@ -294,13 +294,12 @@ def length_of(lanes: Lanes, here: Here, point: Point, flat: Array, step: Array, 
     def good(scale: Array) -> tuple[Array, Array]:
         new = flat + scale[None] * step
         psi = lanes.psi(new[:-1].reshape(lanes.shape))
-        fine = (psi - new[-1][None] >= least) & ((psi > -jnp.inf) | ~used)
+        fine = jnp.all((psi - new[-1][None] >= least) & ((psi > -jnp.inf) | ~used), axis=0)
         if lanes.convex:
-            return jnp.all(fine, axis=0), jnp.all(fine, axis=0)
+            return fine, fine
         error = jnp.abs(psi - (here.psi + scale[None] * first - 0.5 * scale[None] ** 2 * second))
         close = (error <= TRUST * jnp.maximum(point.slack, scale[None] * jnp.abs(first))) | ~bent
-        close &= (scale * way <= most)[None]
-        return jnp.all(fine, axis=0), jnp.all(fine & close, axis=0)
+        return fine, fine & jnp.all(close, axis=0) & (scale * way <= most)
 
     def body(at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         scale, bound, fine, close = at
