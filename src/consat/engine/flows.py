@@ -255,8 +255,8 @@ def simulate_flow(
     limit = ASTRAY * (size.reach + float(np.abs(size.center).max(initial=0.0)) + float(np.abs(first).max(initial=0.0)))
     problem, observer = Problem.of(team, estimates, schedule, limit), Observer.of(team, estimates, choice)
     known = "" if checkpoint is None else fingerprint(team, flow, schedule, first, estimates.layout, float(grid[1]))
-    course = _Course(team, flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
-    return follow(course, estimates, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=known, progress=progress)
+    simulation = _FlowSimulation(team, flow, problem, observer, first, grid, stop, infeasible, _Tally(every=choice.every))
+    return follow(simulation, estimates, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=known, progress=progress)
 
 
 @dataclass
@@ -295,8 +295,8 @@ class _Tally(Steps):
 
 
 @dataclass
-class _Course:
-    """`consat.engine.loop.Course` of a flow. `grid`: times of all samples, s; the other fields are as in `simulate_flow`."""
+class _FlowSimulation:
+    """`consat.engine.loop.Simulation` of a flow. `grid`: times of all samples, s; the other fields are as in `simulate_flow`."""
 
     team: Team
     flow: Flow
@@ -310,72 +310,74 @@ class _Course:
 
     def __post_init__(self) -> None:
         self.end = len(self.grid) - 1
+        self.state = self.flow.start(on_device(self.first))
 
-    def start(self) -> tuple[State, Rows]:
-        state = self.flow.start(on_device(self.first))
-        rows = self.look(state)
-        self.tally.add(rows, self._violated(state))
-        return state, rows
+    def start(self) -> Rows:
+        rows = self.look()
+        self.tally.add(rows, self._violated())
+        return rows
 
-    def advance(self, state: State, every: int) -> tuple[State, Rows, Ending | None]:
+    def advance(self, every: int) -> tuple[Rows, Ending | None]:
         done = self.tally.done
         times = self.grid[done : done + CHUNK + 1]
         padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
-        if not done and self._overflows(state):
-            return state, self.look(state).where(np.zeros(1, dtype=bool)), "diverged"
-        ahead = _advance()(self.flow, self.problem, self.observer, state, on_device(padded))
+        if not done and self._overflows():
+            return self.look().where(np.zeros(1, dtype=bool)), "diverged"
+        ahead = _advance()(self.flow, self.problem, self.observer, self.state, on_device(padded))
         count = int(np.count_nonzero(np.asarray(ahead.reached)[: len(times) - 1]))
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], ahead.seen)._replace(step=times[1 : count + 1])
         if count == len(times) - 1:
+            self.state = ahead.state
             self.tally.add(rows, np.asarray(ahead.wrong)[:count], float(ahead.moved))
-            return ahead.state, rows.where(np.arange(done + 1, done + 1 + count) % every == 0), self._ending(ahead.state)
-        return self._early(state, ahead, rows, every)
+            return rows.where(np.arange(done + 1, done + 1 + count) % every == 0), self._ending()
+        return self._early(ahead, rows, every)
 
-    def _violated(self, state: State) -> Array:
-        """(1, W) which watched constraints are violated in a state."""
-        return violated(self.observer.objective, self.observer.watched, state.x[self.observer.own])[None]
+    def _violated(self) -> Array:
+        """(1, W) which watched constraints are violated now."""
+        return violated(self.observer.objective, self.observer.watched, self.state.x[self.observer.own])[None]
 
-    def _overflows(self, state: State) -> bool:
+    def _overflows(self) -> bool:
         """Whether even the smallest solver step would make the state diverge."""
-        largest = _largest(_rate(self.flow, self.problem, on_device(self.grid[0]), state))
+        largest = _largest(_rate(self.flow, self.problem, on_device(self.grid[0]), self.state))
         return not largest * SHORTEST <= float(self.problem.limit)
 
-    def _early(self, before: State, ahead: Advance, rows: Rows, every: int) -> tuple[State, Rows, Ending]:
+    def _early(self, ahead: Advance, rows: Rows, every: int) -> tuple[Rows, Ending]:
         """End a flow that did not reach the last sample of the chunk, at its last finite state."""
-        done, state = self.tally.done, ahead.state if np.isfinite(_largest(ahead.state)) else before
+        done, finite = self.tally.done, bool(np.isfinite(_largest(ahead.state)))
+        self.state = ahead.state if finite else self.state
         if len(rows.step):
             self.tally.add(rows, np.asarray(ahead.wrong)[: len(rows.step)])
         kept = rows.where(np.arange(done + 1, done + 1 + len(rows.step)) % every == 0)
         ending: Ending = "diverged" if bool(ahead.astray) else "too stiff"
-        if float(ahead.time) > self.tally.time and state is ahead.state:
+        if finite and float(ahead.time) > self.tally.time:
             self.tally.time = float(ahead.time)
-            last = self.look(state)
-            self.tally.add(last, self._violated(state))
+            last = self.look()
+            self.tally.add(last, self._violated())
             kept = kept.joined(last.where(np.array([self.tally.done % every == 0])))
-        return state, kept, ending
+        return kept, ending
 
-    def _ending(self, state: State) -> Ending | None:
+    def _ending(self) -> Ending | None:
         """Reason to end the run now; None to go on."""
         tally = self.tally
         if self.stop == "satisfied" and tally.good > HOLD / SAMPLE:
             return "satisfied"
         if self.stop == "never" or tally.time < self.problem.schedule.duration + HOLD:
             return None
-        at = self.positions(state)
+        at = self.positions()
         settled = tally.drift <= SETTLED * max(float(np.abs(at).max(initial=0.0)), 1e-300)
         return "settled" if settled and (self.stop == "converged" or self.infeasible(at)) else None
 
     def agree(self, stop: bool) -> bool:
         return stop
 
-    def look(self, state: State) -> Rows:
-        rows = _look(self.flow, self.problem, self.observer, on_device(self.tally.time), state)
+    def look(self) -> Rows:
+        rows = _look(self.flow, self.problem, self.observer, on_device(self.tally.time), self.state)
         return jax.tree.map(np.asarray, rows)
 
-    def positions(self, state: State) -> np.ndarray:
-        return np.array(state.x[self.observer.own])
+    def positions(self) -> np.ndarray:
+        return np.array(self.state.x[self.observer.own])
 
-    def told(self, rows: Rows) -> Mapping[str, Any]:
+    def account(self, rows: Rows) -> Mapping[str, Any]:
         return {
             "clock": "time",
             "velocity": rows.velocity,

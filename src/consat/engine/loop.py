@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,27 +36,43 @@ class Steps:
     every: int = 1
 
 
-class Course(Protocol):
-    """A simulation that advances by chunks of steps."""
+class Traceable(Protocol):
+    """A simulation of which `traced` makes a trace."""
 
-    tally: Any
-    """Counters: `Steps` or a subclass."""
-    end: int
-    """Largest number of steps."""
-
-    def start(self) -> tuple[Any, Rows]:
-        """The initial state and its record."""
+    def positions(self) -> np.ndarray:
+        """(N, d) positions of all agents."""
         ...
 
-    def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
-        """Advance `state` by one chunk. The input buffers are donated and must not be used again.
+    def account(self, rows: Rows) -> Mapping[str, Any]:
+        """Fields of the `Trace` that differ between rounds and flows. `rows`: the record of the run."""
+        ...
+
+
+class Simulation(Traceable, Protocol):
+    """A simulation, in rounds or in continuous time, that advances by chunks of steps until it ends."""
+
+    state: Any
+    """State after the last step."""
+    tally: Any
+    """Counters: `Steps` or a subclass."""
+
+    @property
+    def end(self) -> int:
+        """Largest number of steps."""
+        ...
+
+    def start(self) -> Rows:
+        """Begin. Returns the record of the start."""
+        ...
+
+    def advance(self, every: int) -> tuple[Rows, Ending | None]:
+        """Advance by one chunk.
 
         Args:
-            state: the state.
             every: record one step in `every`.
 
         Returns:
-            The new state, the record, and the reason to end the run; None to go on.
+            The record, and the reason to end the run; None to go on.
         """
         ...
 
@@ -63,27 +80,19 @@ class Course(Protocol):
         """Whether any of the processes wants to stop. `stop`: whether this one does."""
         ...
 
-    def look(self, state: Any) -> Rows:
+    def look(self) -> Rows:
         """Record of the present state."""
-        ...
-
-    def positions(self, state: Any) -> np.ndarray:
-        """(N, d) positions of all agents."""
-        ...
-
-    def told(self, rows: Rows) -> Mapping[str, Any]:
-        """Fields of the `Trace` that differ between rounds and flows. `rows`: the record of the run."""
         ...
 
 
 def follow(
-    course: Course, copies: Estimates, choice: Choice, *, sink: Sink, checkpoint: Checkpoint | None, problem: str,
+    simulation: Simulation, copies: Estimates, choice: Choice, *, sink: Sink, checkpoint: Checkpoint | None, problem: str,
     progress: Callable[[float, float], None],
 ) -> Trace:  # fmt: skip
     """Run a simulation to its end.
 
     Args:
-        course: the simulation.
+        simulation: the simulation.
         copies: the layout of estimates.
         choice: what is recorded.
         sink: where to record.
@@ -95,27 +104,27 @@ def follow(
 
     def keep(rows: Rows) -> None:
         sink.append(rows)
-        course.tally.recorded += len(rows.step)
-        course.tally.every = sink.every
+        simulation.tally.recorded += len(rows.step)
+        simulation.tally.every = sink.every
 
     def save() -> None:
         if checkpoint is not None:
             sink.flush()
-            checkpoint.write(state, course.tally.__dict__, problem)
+            checkpoint.write(simulation.state, simulation.tally.__dict__, problem)
 
     with CompileClock() as clock, heeded() as stopped:
-        state, rows = course.start()
-        taken = None if checkpoint is None else checkpoint.restore(state, problem)
+        rows = simulation.start()
+        taken = None if checkpoint is None else checkpoint.restore(simulation.state, problem)
         if taken is None:
             keep(rows)
         else:
-            state, course.tally = taken[0], type(course.tally)(**taken[1])
-            sink.every = course.tally.every
-        while course.tally.done < course.end:
-            state, rows, found = course.advance(state, sink.every)
+            simulation.state, simulation.tally = taken[0], type(simulation.tally)(**taken[1])
+            sink.every = simulation.tally.every
+        while simulation.tally.done < simulation.end:
+            rows, found = simulation.advance(sink.every)
             keep(rows)
-            heard = _heard(progress, course.tally.done / course.end, course.tally.margin)
-            if course.agree(stopped() or not heard) and found is None:
+            heard = _heard(progress, simulation.tally.done / simulation.end, simulation.tally.margin)
+            if simulation.agree(stopped() or not heard) and found is None:
                 found = "interrupted"
             if found is not None:
                 ending = found
@@ -123,29 +132,34 @@ def follow(
             if checkpoint is not None and checkpoint.due():
                 save()
         save()
-    if course.tally.done % sink.every:  # the last step is always recorded
-        sink.append(course.look(state))
-    rows = sink.close()
+    if simulation.tally.done % sink.every:  # the last step is always recorded
+        sink.append(simulation.look())
+    return traced(simulation, sink.close(), copies, choice, ending=ending, seconds=clock.seconds, file=sink.path)
+
+
+def traced(
+    simulation: Traceable, rows: Rows, copies: Estimates, choice: Choice, *, ending: Ending, seconds: Mapping[str, float],
+    file: Path | None = None,
+) -> Trace:  # fmt: skip
+    """The trace of a simulation.
+
+    Args:
+        simulation: the simulation.
+        rows: its record.
+        copies: the layout of estimates.
+        choice: what was recorded.
+        ending: why it ended.
+        seconds: wall-clock time, s, for ``compile`` and ``run``.
+        file: the file of the record; None if it is in memory.
+    """
     held = slice(None) if choice.copies is None else choice.copies
     return Trace(
-        steps=rows.step,
-        position=rows.position,
-        margin=rows.margin,
-        smooth_margin=rows.smooth_margin,
-        agent_margin=rows.agent_margin,
-        estimate=rows.estimate,
-        integral=rows.integral,
-        bound=rows.bound,
-        holder=copies.holder[held],
-        held=copies.position[held],
-        cluster=copies.cluster,
-        ending=ending,
-        seconds=clock.seconds,
-        recorded=None if choice.everyone else choice.agents,
-        final=course.positions(state),
-        file=sink.path,
-        **course.told(rows),
-    )
+        steps=rows.step, position=rows.position, margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin,
+        estimate=rows.estimate, integral=rows.integral, bound=rows.bound,
+        holder=copies.holder[held], held=copies.position[held], cluster=copies.cluster,
+        ending=ending, seconds=seconds, recorded=None if choice.everyone else choice.agents, final=simulation.positions(), file=file,
+        **simulation.account(rows),
+    )  # fmt: skip
 
 
 def _heard(progress: Callable[[float, float], None], done: float, margin: float) -> bool:

@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import Array
 
 from consat.engine.bodies import Body
 from consat.engine.checkpoint import Checkpoint, fingerprint
-from consat.engine.chunks import Chunk, Engine, Kept, OneProcess
+from consat.engine.chunks import Engine, OneProcess
 from consat.engine.live import Live
 from consat.engine.loop import follow
-from consat.engine.recording import Choice, Memory, Rows, Sink, velocities
-from consat.engine.round import Now
+from consat.engine.recording import Choice, Memory, Rows, Sink
 from consat.engine.rules import ENOUGH, HOLD, PATIENCE, Rules, longest_hold, stillness, turn_after
-from consat.engine.tally import Tally
-from consat.engine.violations import shares
-from consat.engine.world import World, world_of
+from consat.engine.simulation import RoundsSimulation
+from consat.engine.world import world_of
 from consat.faults import Faults
-from consat.numerics import float64, quick_compilation
+from consat.numerics import float64
 from consat.problem.objective import Nu
 from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending, Trace
-from consat.robots.conditions import conditions
-from consat.robots.drive import Drive, Report
-from consat.robots.simulated import Simulated
 from consat.settings import Stop
 
 
@@ -113,10 +107,10 @@ def simulate_rounds(
     )  # fmt: skip
     how_run = (protocol, nu, size, first, faults, body, copies.layout, convex, *["events"] * events)
     problem = "" if checkpoint is None else fingerprint(team, *how_run)
-    course = _Course(team, engine, rules, choice, body, turn)
+    simulation = _Run(team, engine, choice, body, rules, turn)
     if turn is not None and checkpoint is not None and checkpoint.turned:
-        course.turn(np.zeros((turn.after.count, team.dimension)))
-    return follow(course, copies, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=problem, progress=progress)
+        simulation.turn(np.zeros((turn.after.count, team.dimension)))
+    return follow(simulation, copies, choice, sink=sink or Memory(choice.every), checkpoint=checkpoint, problem=problem, progress=progress)
 
 
 class Turn(NamedTuple):
@@ -147,102 +141,26 @@ def _over(choice: Choice, before: Estimates, after: Estimates) -> Choice:
     return dataclasses.replace(choice, copies=np.where(found, rows, after.own[position]))
 
 
-class _Course:
-    """`consat.engine.loop.Course` in rounds; arguments as in `simulate_rounds`."""
+class _Run(RoundsSimulation):
+    """A simulation in rounds that its rules end. Arguments as in `simulate_rounds`."""
 
-    def __init__(self, team: Team, engine: Engine, rules: Rules, choice: Choice, body: Body | None, turn: Turn | None) -> None:
-        self._turn = turn
-        self._team, self._engine, self._rules, self._choice = team, engine, rules, choice
-        self._period = None if body is None else 1.0 / body.rate
-        self.tally, self.end = Tally(every=choice.every), rules.end
+    def __init__(self, team: Team, engine: Engine, choice: Choice, body: Body | None, rules: Rules, turn: Turn | None) -> None:
+        super().__init__(team, engine, choice, None if body is None else 1.0 / body.rate)
+        self._rules, self._turn = rules, turn
+        self.end = rules.end
 
-    def start(self) -> tuple[Any, Rows]:
-        state, chunk = self._engine.start()
-        self._last = state
-        return state, self._count(chunk, 1)
-
-    def advance(self, state: Any, every: int) -> tuple[Any, Rows, Ending | None]:
-        done = self.tally.done
-        streak = (self.tally.streak, self.tally.near) if done >= self._rules.least else None
-        state, chunk = self._engine.advance(state, done, self._rules.chunk(self.tally), streak, every)
-        self._last = state
-        rows = self._count(chunk, every)
-        ending = self._rules.ending(self.tally, functools.partial(self.positions, state))
-        if ending is None and self._turn is not None and self._rules.turns(self.tally):
-            self.turn(self._turn.after.carried(self._turn.before, np.asarray(state.state.x), self.positions(state)))
-            state, _ = self._engine.start()
-            self.tally.turned, self.tally.near = self.tally.done, 0
-        return state, rows, ending
+    def advance(self, every: int) -> tuple[Rows, Ending | None]:
+        tally = self.tally
+        streak = (tally.streak, tally.near) if tally.done >= self._rules.least else None
+        rows = self.go(self._rules.chunk(tally), every, streak=streak)
+        ending = self._rules.ending(tally, self.positions)
+        if ending is None and self._turn is not None and self._rules.turns(tally):
+            self.turn(self._turn.after.carried(self._turn.before, np.asarray(self.state.state.x), self.positions()))
+            self.state, _ = self.engine.start()
+            tally.turned, tally.near = tally.done, 0
+        return rows, ending
 
     def turn(self, first: np.ndarray) -> None:
         """Switch to the other layout. `first`: (C, d) initial estimates."""
         assert self._turn is not None
-        self._engine = self._turn.engine(first)
-
-    def agree(self, stop: bool) -> bool:
-        return self._engine.agree(stop)
-
-    def positions(self, state: Any) -> np.ndarray:
-        return self._engine.positions(state)
-
-    def _count(self, chunk: Chunk, every: int) -> Rows:
-        numbers = self.tally.add(chunk)
-        chosen = np.flatnonzero(numbers % every == 0)
-        kept = Kept(*(np.asarray(leaf)[: len(chosen)] for leaf in chunk.kept))
-        margins = [np.asarray(leaf)[chosen] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound)]
-        return self._rows(numbers[chosen], margins, kept)
-
-    def look(self, state: Any) -> Rows:
-        tally = self.tally
-        margins = [np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound)]
-        return self._rows(np.array([tally.done]), margins, Kept(*(leaf[None] for leaf in self._engine.look(state, tally.done))))
-
-    def _rows(self, step: np.ndarray, margins: Sequence[np.ndarray], kept: Kept) -> Rows:
-        margin, smooth_margin, bound = margins
-        estimate = None if self._choice.copies is None else kept.estimate
-        heading = kept.heading if self._engine.world.drive is not None else None
-        return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound, heading)
-
-    def told(self, rows: Rows) -> Mapping[str, Any]:
-        tally = self.tally
-        return {
-            "clock": "round",
-            "velocity": velocities(rows.step, rows.position, 1.0 if self._period is None else self._period),
-            "satisfied_from": float(tally.last_bad + 1) if tally.last_bad < tally.done else None,
-            "messages": tally.messages,
-            "floats_sent": tally.floats,
-            "bytes": tally.bytes,
-            **tally.knowledge,
-            "turned": tally.turned,
-            "period": self._period,
-            "heading": rows.heading,
-            "motion": None if self._period is None else tally.motion(self._period) | driven(self._team, self._engine.world, self._last),
-            "violated": None if tally.violated is None else shares(self._team, tally.violated, tally.done + 1),
-        }
-
-
-def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
-    """Fields of the summary for robots: smallest distances, m, contacts, stuck robots, and conditions of the collision guarantee that did
-    not hold."""
-    if world.drive is None or now.robots is None:
-        none = {"smallest_distance": None, "clearance": None, "simulator": None}
-        return none | {"contacts": 0, "collisions": 0, "stuck": [], "unproven": []}
-    drive, robots = world.drive, now.robots
-    report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
-    noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
-    gap, clear = float(report.smallest_distance), float(report.clearance)
-    return {
-        "smallest_distance": gap if np.isfinite(gap) else None,
-        "clearance": clear if np.isfinite(clear) else None,
-        "contacts": int(report.contacts),
-        "collisions": int(report.collisions),
-        "stuck": [team.ids[i] for i in np.flatnonzero(stuck).tolist()],
-        "unproven": list(conditions(drive, noise=noise, wind=wind, report=report)),
-        "simulator": drive.model.name if isinstance(drive.model, Simulated) else None,
-    }
-
-
-@functools.cache
-def _ended() -> Callable[..., tuple[Report, Array]]:
-    """`Drive.ended` compiled as one program."""
-    return jax.jit(Drive.ended, static_argnums=0, compiler_options=quick_compilation())
+        self.engine = self._turn.engine(first)

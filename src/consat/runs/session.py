@@ -10,44 +10,30 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
 from consat.certify.certificate import Verdict, judged
 from consat.certify.reasons import explain
-from consat.engine.bodies import Body
-from consat.engine.carry import Names, carried, placed, robots_carried
-from consat.engine.chunks import CHUNK, Chunk, OneProcess
-from consat.engine.live import Live
-from consat.engine.recording import Choice, Memory, Rows, velocities
-from consat.engine.round import Now
-from consat.engine.rounds import driven
-from consat.engine.tally import Tally, known_of
-from consat.engine.world import world_of
+from consat.engine.chunks import CHUNK
+from consat.engine.loop import traced
+from consat.engine.recording import Memory, Rows
+from consat.engine.tally import known_of
 from consat.errors import Fault, InvalidSettings, InvalidTeam
-from consat.numerics import float64, on_device
+from consat.numerics import float64
 from consat.problem import structure
 from consat.problem.agent import Agent
-from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, place_of
-from consat.problem.constraints.library import ADJUSTABLE, farthest
-from consat.problem.graphs import require_connected
+from consat.problem.changes import changed, changes_of, is_adjustment, is_structural, place_of
 from consat.problem.parameters import vector
 from consat.problem.team import Team
-from consat.problem.units import scale
-from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
-from consat.protocols.interior_point import InteriorState
-from consat.protocols.local.interior.layout import form_of
+from consat.protocols import FLOWS, ROUNDS
 from consat.results.result import Result
-from consat.results.trace import Trace
 from consat.runs.options import RATE, Options
-from consat.runs.preparation import Prepared, copies_of, robots_of, scenario_of, settings_of
+from consat.runs.preparation import Prepared, robots_of, scenario_of, settings_of
+from consat.runs.running import Running
 from consat.runs.summary import summarise
 from consat.scenario import Scenario
 from consat.settings import Layout, Sends, Smoothing
-
-PLACES = frozenset(("center", "vector", "radius", "low", "high"))
-"""Parameters that are lengths: while they are small, a constraint does not ask an agent to move beyond the team's region."""
 
 
 class Assessment(NamedTuple):
@@ -64,20 +50,6 @@ class Assessment(NamedTuple):
     bounds: tuple[float | None, float | None]
     reasons: list[str]
     positions: np.ndarray
-
-
-class _Engine(NamedTuple):
-    """Engine for one structure of the team.
-
-    Attributes:
-        ready: the prepared team when the engine was built.
-        carrier: engine that computes the rounds.
-        live: constraint parameters, as NumPy arrays that are modified in place.
-    """
-
-    ready: Prepared
-    carrier: OneProcess
-    live: Live
 
 
 class Session:
@@ -130,19 +102,10 @@ class Session:
             raise InvalidSettings(
                 f"protocol {kind} flows in continuous time, but a session goes in rounds; choose one of {', '.join(ROUNDS)}"
             )
-        self._protocol = with_gains(ROUNDS[kind](), settings.protocol)
-        self._body = self._body_of(scenario.team)
-        self._faults = self._options.faults(settings.start.seed)
-        ready = Prepared.of(scenario.team, settings)
-        self._engine = self._built(ready, ready.first(drive=self._body.drive), self._body)
-        self._extent = ready.size.extent / ready.size.length
-        self._well_inside = ready.size.reach - float(np.abs(ready.size.center).max(initial=0.0))
-        state, chunk = self._engine.carrier.start()
-        self._state: Now = state
-        self._tally, self._record = Tally(), Memory()
-        self._own_margins: np.ndarray | None = None
-        self._changed_at, self._stepped = 0, True
-        self._take(chunk)
+        self._running = Running(Prepared.of(scenario.team, settings), self._options)
+        self._record = Memory()
+        self._changed_at = 0
+        self._take(self._running.simulation.start())
 
     # ---- stepping -----------------------------------------------------------------------------------------------------------------------
 
@@ -161,28 +124,19 @@ class Session:
         left = int(rounds)
         while left:
             count = min(CHUNK, left)
-            self._state, chunk = self._engine.carrier.advance(self._state, self._tally.done, count, None, 1)
-            self._take(chunk)
+            self._take(self._running.simulation.go(count, self._record.every))
             left -= count
         return self
 
-    def _take(self, chunk: Chunk) -> None:
-        chunk = jax.tree.map(np.asarray, chunk)
-        numbers = self._tally.add(chunk)
-        count = len(numbers)
-        kept = [leaf[:count] for leaf in (chunk.margin, chunk.smooth_margin, chunk.bound, chunk.kept.position, chunk.kept.agent_margin)]
-        margin, smooth, bound, position, margins = kept
-        self._own_margins, self._positions, self._stepped = margins[-1], position[-1], True
-        chosen = numbers % self._record.every == 0
-        if chosen.any():
-            heading = None if self._body.drive is None else chunk.kept.heading[:count]
-            rows = Rows(numbers, position, None, margin, smooth, margins, None, None, bound, heading)
-            self._record.append(rows.where(np.flatnonzero(chosen)))
+    def _take(self, rows: Rows) -> None:
+        recorded = len(rows.step) and rows.step[-1] == self.round
+        self._record.append(rows)
+        self._own_margins, self._stepped = rows.agent_margin[-1] if recorded else None, True
 
     @property
     def round(self) -> int:
         """Number of rounds so far."""
-        return self._tally.done
+        return self._running.simulation.tally.done
 
     @property
     def protocol(self) -> str:
@@ -192,17 +146,17 @@ class Session:
     @property
     def rate(self) -> float:
         """Rounds per second, Hz."""
-        return self._body.rate
+        return self._running.body.rate
 
     @property
     def time(self) -> float:
         """Time since the start, s: `round` / `rate`."""
-        return self._tally.done / self._body.rate
+        return self.round / self.rate
 
     @property
     def positions(self) -> np.ndarray:
         """(N, d) positions of the bodies, in the order of ``session.team.ids``."""
-        return np.array(self._positions)
+        return self._running.simulation.positions()
 
     @property
     def margins(self) -> np.ndarray:
@@ -213,8 +167,7 @@ class Session:
     @float64
     def headings(self) -> np.ndarray | None:
         """(N,) headings of the robots, rad; None where bodies are points."""
-        drive, robots = self._body.drive, self._state.robots
-        return None if drive is None or robots is None else np.array(drive.model.heading(robots.state))
+        return self._running.headings
 
     @property
     def margin(self) -> float:
@@ -229,7 +182,7 @@ class Session:
     @property
     def known(self) -> Literal["satisfied", "infeasible"] | None:
         """What every agent knows by itself about the team: ``satisfied``, ``infeasible`` or None."""
-        return known_of(self._tally) if self._stepped else None
+        return known_of(self._running.simulation.tally) if self._stepped else None
 
     # ---- changing -----------------------------------------------------------------------------------------------------------------------
 
@@ -248,18 +201,14 @@ class Session:
         """
         if not parameters:
             return self
-        team, live = self._engine.ready.team, self._engine.live.parameters
-        changes = changes_of(team, agent, constraint, parameters, live)
+        team = self._running.ready.team
+        changes = changes_of(team, agent, constraint, parameters, self._running.parameters)
         if not is_adjustment(team, changes):
             new = changed(self.team, changes)
-            if is_structural(team, changes) or self._bends_otherwise(new):
+            if is_structural(team, changes) or self._running.bends_otherwise(new):
                 self._restructure(new)
                 return self
-        for change in changes:
-            for key, value in change.given.items():
-                live[change.family][key][change.member] = value
-            self._reach_out(change)
-        self._note_changes({int(team.owner[change.number]) for change in changes})
+        self._running.set(changes)
         self._mark_change()
         return self
 
@@ -279,8 +228,7 @@ class Session:
         value = vector(position, self.dimension, ("position",), "position", f"agent {agent!r}", faults)
         if value is None:
             raise InvalidTeam(faults)
-        self._state = placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)
-        self._positions = np.asarray(self._state.body)
+        self._running.place(i, value)
         self._own_margins, self._stepped = None, False
         return self
 
@@ -298,7 +246,7 @@ class Session:
         new = structure.with_agent(self.team, agent, links)
         near = [k for i, j in new.links.tolist() for k in (i, j) if new.count - 1 in (i, j) and k != new.count - 1]
         if agent.start is None and near:
-            new.starts[-1] = np.mean([self._positions[self._place_of(new.ids[k])] for k in near], axis=0)
+            new.starts[-1] = np.mean(self.positions[[self._place_of(new.ids[k]) for k in near]], axis=0)
         self._restructure(new)
         return self
 
@@ -385,10 +333,7 @@ class Session:
         Raises:
             InvalidSettings: `share` is out of range.
         """
-        options = dataclasses.replace(self._options, loss=share)
-        self._faults = options.faults(self._faults.seed)
-        self._options = options
-        self._restructure(self.team)
+        self._restructure(self.team, dataclasses.replace(self._options, loss=share))
         return self
 
     # ---- looking ------------------------------------------------------------------------------------------------------------------------
@@ -396,17 +341,12 @@ class Session:
     @property
     def dimension(self) -> int:
         """d, the dimension of the space."""
-        return self._engine.ready.team.dimension
+        return self._running.ready.team.dimension
 
     @property
     def team(self) -> Team:
         """The team with the present parameters of its constraints. Parameters that move with time keep their schedules."""
-        team = self._engine.ready.team
-        families = [
-            dataclasses.replace(family, parameters={key: np.array(value) for key, value in own.items()})
-            for family, own in zip(team.families, self._engine.live.parameters, strict=True)
-        ]
-        return team.with_constraints(families, team.owner, team.names)
+        return self._running.team
 
     @float64
     def assess(self) -> Assessment:
@@ -416,32 +356,21 @@ class Session:
     @float64
     def result(self) -> Result:
         """Result of the rounds so far, as of `consat.run`. Agents that were removed are not in it."""
-        ready, tally = self._engine.ready, self._tally
+        ready, simulation, team = self._running.ready, self._running.simulation, self.team
         rows = self._record.close()
-        if not len(rows.step) or rows.step[-1] != tally.done:
-            margin, smooth, bound = (np.array([number]) for number in (tally.margin, tally.smooth_margin, tally.bound))
-            heading = None if (now := self.headings) is None else now[None]
-            done, own = np.array([tally.done]), self._margins()[None]
-            last = Rows(done, self._positions[None], None, margin, smooth, own, None, None, bound, heading)
-            rows = rows.joined(last) if len(rows.step) else last
-        period, team = 1.0 / self._body.rate, self.team
-        trace = Trace(
-            clock="round", steps=rows.step, position=rows.position, velocity=velocities(rows.step, rows.position, period),
-            margin=rows.margin, smooth_margin=rows.smooth_margin, agent_margin=rows.agent_margin, estimate=None, integral=None,
-            holder=ready.copies.holder, held=ready.copies.position, cluster=ready.copies.cluster, ending="out of time",
-            satisfied_from=float(tally.last_bad + 1) if tally.last_bad < tally.done else None, messages=tally.messages,
-            floats_sent=tally.floats, bytes=tally.bytes, known=self.known, known_from=None,
-            seconds={"compile": 0.0, "run": 0.0}, period=period,
-            bound=rows.bound, heading=rows.heading, motion=tally.motion(period) | driven(team, self._engine.carrier.world, self._state),
-        )  # fmt: skip
-        scenario = dataclasses.replace(scenario_of(team), name=self._name)
+        if rows.step[-1] != self.round:
+            rows = rows.joined(simulation.look())
+        seconds = {"compile": 0.0, "run": 0.0}
+        trace = traced(simulation, rows, ready.copies, simulation.choice, ending="out of time", seconds=seconds)
+        trace = dataclasses.replace(trace, known=self.known, known_from=None, violated=None)  # they were counted with other constraints
         summary = summarise(
-            scenario, ready.settings, ready.schedule, ready.size, trace, robots=self._options.robots, since=self._changed_at * period
-        )
-        return Result(summary, trace=trace, team=team, scenario=scenario.text)
+            dataclasses.replace(scenario_of(team), name=self._name), ready.settings, ready.schedule, ready.size, trace,
+            robots=self._options.robots, since=self._changed_at / self.rate,
+        )  # fmt: skip
+        return Result(summary, trace=trace, team=team, scenario=scenario_of(team).text)
 
     def __repr__(self) -> str:
-        team = self._engine.ready.team
+        team = self._running.ready.team
         return f"<Session of {self._name}: {team.count} agents, round {self.round}, margin {self.margin:.4g}>"
 
     # ---- inside -------------------------------------------------------------------------------------------------------------------------
@@ -454,101 +383,19 @@ class Session:
     def _margins(self) -> np.ndarray:
         """(N,) margins of the agents where they are, of the constraints as they are; computed anew after a change."""
         if self._own_margins is None:
-            self._own_margins = self._engine.carrier.margins(self._state, self.round)
+            self._own_margins = self._running.margins
         return self._own_margins
 
-    def _body_of(self, team: Team) -> Body:
-        """Motion of the bodies of a team."""
-        body = self._options.pace(self._kind, team).body
-        assert body is not None, "a session has a rate"
-        return body
-
-    def _built(self, ready: Prepared, first: np.ndarray, body: Body) -> _Engine:
-        team = ready.team
-        require_connected(team)
-        live = Live.of(team, 1.0 / body.rate, all_of_them=True)
-        assert live is not None
-        world = world_of(
-            team, ready.copies, ready.schedule.final, ready.size, convex=ready.convex, faults=self._faults, body=body,
-            speaks=self._protocol.speaks, live=live, events=self._options.events,
-        )  # fmt: skip
-        choice = Choice.of(team, ready.copies, "all", estimates=False)
-        carrier = OneProcess(self._protocol, world, first, self._faults.seed, choice, None)
-        return _Engine(ready, carrier, live)
-
-    def _restructure(self, team: Team) -> None:
-        """Build an engine for a team of another structure, and transfer the state. If an error is raised, the session is unchanged."""
-        old = self._engine
-        copies = copies_of(team, old.ready.settings.protocol)
-        now, size = scale(team), old.ready.size  # units stay the same, but the region of proofs must cover the new constraints
-        extent = now.extent + now.reach + float(np.linalg.norm(np.asarray(now.center) - np.asarray(size.center)))
-        ready = old.ready._replace(team=team, copies=copies, size=size._replace(extent=max(size.extent, extent)))
-        kind = str(ready.settings.protocol.kind)
-        names = [Names.of(each.team, each.copies, pairs=kind in PAIRED) for each in (old.ready, ready)]
-        first, place = self._first(ready)
-        body = self._body_of(team)
-        engine = self._built(ready, first, body)
-        state, _ = engine.carrier.start()
-        inner = carried(self._protocol.per, self._state.state, state.state, *names)
-        robots = state.robots
-        if robots is not None and self._state.robots is not None and body.drive is not None:
-            robots = robots_carried(body.drive.model, self._state.robots, robots, names[0].agent, names[1].agent)
-        inner = inner.begun_anew() if isinstance(inner, InteriorState) else inner
-        state = state._replace(state=inner, body=on_device(place), key=self._state.key, robots=robots)
-        # the session is modified only below, where no error can be raised
-        self._record = self._record.renamed(names[0].agent, names[1].agent)
-        self._tally.violated = np.zeros(len(Choice.of(team, copies, "none").watched), dtype=int)
-        self._engine, self._state, self._positions, self._body = engine, state, place, body
+    def _restructure(self, team: Team, options: Options | None = None) -> None:
+        """Change the structure of the team, or the options. If an error is raised, the session is unchanged."""
+        options = options or self._options
+        new = self._running.become(team, options)
+        self._record = self._record.renamed(self._running.ready.team.ids, team.ids)
+        self._running, self._options = new, options
         self._mark_change()
-        self._extent = max(self._extent, ready.size.extent / ready.size.length)
-
-    def _first(self, ready: Prepared) -> tuple[np.ndarray, np.ndarray]:
-        """(C, d) initial estimates, each at the position of its owner's body, and (N, d) positions of bodies."""
-        team, copies = ready.team, ready.copies
-        place = {agent: k for k, agent in enumerate(self._engine.ready.team.ids)}
-        drawn = ready.first()
-        body = drawn[copies.own]
-        for i, agent in enumerate(team.ids):
-            if agent in place:
-                body[i] = self._positions[place[agent]]
-            elif np.isfinite(team.starts[i]).all():
-                body[i] = team.starts[i]
-        return body[copies.position], body
 
     def _place_of(self, agent: str) -> int:
-        return place_of(self._engine.ready.team, agent)
-
-    def _bends_otherwise(self, team: Team) -> bool:
-        """Whether the compiled curvature of a user-defined constraint is not valid for a team with other parameters."""
-        before = self._engine.ready.team
-        return any(
-            form_of(old, team.dimension) != form_of(new, team.dimension)
-            for old, new in zip(before.families, team.families, strict=True)
-            if old.psi not in ADJUSTABLE
-        )
-
-    def _reach_out(self, change: Change) -> None:
-        """Enlarge the region of proofs, if needed, so that it covers a changed constraint."""
-        size, carrier = self._engine.ready.size, self._engine.carrier
-        family = self._engine.ready.team.families[change.family]
-        if carrier.world.everyone.interior is None or family.psi not in ADJUSTABLE:
-            return
-        if PLACES.issuperset(change.given) and all(np.abs(np.asarray(value)).max() <= self._well_inside for value in change.given.values()):
-            return  # the most frequent case
-        own = {key: np.asarray(array)[[change.member]] for key, array in self._engine.live.parameters[change.family].items()}
-        asked = farthest(family.psi, own, np.asarray(size.center)) / size.length
-        if asked <= self._extent:
-            return
-        self._extent = asked if family.arity == 1 else self._extent + asked  # relative to another agent, which may itself be that far out
-        everyone, interior = carrier.world.everyone, carrier.world.everyone.interior
-        interior = dataclasses.replace(interior, units=interior.units._replace(extent=on_device(self._extent)))
-        carrier.world = dataclasses.replace(carrier.world, everyone=dataclasses.replace(everyone, interior=interior))
-
-    def _note_changes(self, owners: Iterable[int]) -> None:
-        """Raise the count of changes of the agents whose constraints have changed, and drop their bounds, so that all proofs restart."""
-        inner = self._state.state
-        if isinstance(inner, InteriorState):
-            self._state = self._state._replace(state=inner.changed(list(owners)))
+        return place_of(self._running.ready.team, agent)
 
 
 @float64
