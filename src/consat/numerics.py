@@ -137,12 +137,12 @@ def laid_out(values: Mapping[str, Array], members: Array) -> dict[str, Array]:
 
     Args:
         values: parameters, each (M_f, …).
-        members: (chunks, m, A) indices of the constraints.
+        members: (…, A) indices of the constraints.
 
     Returns:
-        parameters, each (chunks, m, …, A).
+        parameters, each (…, A), with the axes of the parameter before A.
     """
-    return {key: jnp.moveaxis(pick(jnp.asarray(array), members), 2, -1) for key, array in values.items()}
+    return {key: jnp.moveaxis(pick(jnp.asarray(array), members), members.ndim - 1, -1) for key, array in values.items()}
 
 
 @jax.tree_util.register_dataclass

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -21,9 +21,9 @@ from consat.engine.violations import shares
 from consat.engine.world import World
 from consat.numerics import quick_compilation
 from consat.problem.team import Team
-from consat.robots.conditions import conditions
-from consat.robots.drive import Drive, Report
-from consat.robots.simulated import Simulated
+
+if TYPE_CHECKING:
+    from consat.robots.drive import Report
 
 
 class RoundsSimulation:
@@ -116,6 +116,9 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
     if world.drive is None or now.robots is None:
         none = {"smallest_distance": None, "clearance": None, "simulator": None}
         return none | {"contacts": 0, "collisions": 0, "stuck": [], "unproven": []}
+    from consat.robots.conditions import conditions
+    from consat.robots.simulated import Simulated
+
     drive, robots = world.drive, now.robots
     report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
     noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
@@ -134,4 +137,6 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
 @functools.cache
 def _ended() -> Callable[..., tuple[Report, Array]]:
     """`Drive.ended` compiled as one program."""
+    from consat.robots.drive import Drive
+
     return jax.jit(Drive.ended, static_argnums=0, compiler_options=quick_compilation())

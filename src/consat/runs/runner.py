@@ -13,7 +13,6 @@ import jax
 
 from consat.engine import checkpoint as checkpoints
 from consat.engine.files import Files, claim
-from consat.engine.flows import simulate_flow
 from consat.engine.recording import Choice, Who
 from consat.engine.rounds import simulate_rounds
 from consat.errors import InvalidSettings
@@ -247,6 +246,8 @@ def _run(
 
 
 def _flow(on: Prepared, **options: Any) -> Trace:
+    from consat.engine.flows import simulate_flow
+
     asked = on.settings.protocol
     flow = with_gains(FLOWS[str(asked.kind)](), asked)
     return simulate_flow(on.team, flow, on.copies, on.schedule, on.first(), infeasible=on.hopeless, **options)

@@ -26,7 +26,7 @@ from consat.problem.team import Team
 from consat.problem.units import Scale, scale
 from consat.protocols import PAIRED, ROUNDS, with_gains
 from consat.protocols.interior_point import InteriorState
-from consat.protocols.local.interior.layout import form_of
+from consat.protocols.local.interior.batches import form_of
 from consat.runs.options import Options
 from consat.runs.preparation import Prepared, copies_of
 

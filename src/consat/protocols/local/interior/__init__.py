@@ -18,9 +18,10 @@ from consat.problem.team import Team
 from consat.problem.units import Scale
 from consat.protocols.estimates import Estimates
 from consat.protocols.local.interior import state, step
+from consat.protocols.local.interior.batches import Batch, Plan, plan_of
 from consat.protocols.local.interior.lanes import Lanes, Units
-from consat.protocols.local.interior.layout import Batch, Plan, Route, Shared, Way, plan_of, route_of
 from consat.protocols.local.interior.proof import Proof
+from consat.protocols.local.interior.routes import Route, Shared, Way, route_of
 from consat.protocols.local.interior.state import Gains, Memory
 from consat.protocols.local.interior.step import Mail
 
@@ -90,7 +91,7 @@ class Interior:
         """Initial state for the initial estimates `x`, (C, d)."""
 
         def start(batch: Batch) -> Memory:
-            y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows[0], 0.0), 1, -1)
+            y = jnp.moveaxis(taken(_normal(x, self.units), batch.rows, 0.0), 1, -1)
             return _out(state.begin(_lanes(batch, self.units, gains, self.plan.exact), y, gains))
 
         return self._collected([start(batch) for batch in self.plan.batches])
@@ -108,8 +109,8 @@ class Interior:
         y, told = _normal(memory.y, units), margin / units.psi
 
         def turn(batch: Batch) -> tuple[Memory, Mail]:
-            agents, rows, ends, shared = batch.agents[0], batch.rows[0], batch.pairs[0], batch.shared[0]
-            multiplier = taken(memory.multiplier, batch.members[0], 0.0)
+            agents, rows, ends, shared = batch.agents, batch.rows, batch.pairs, batch.shared
+            multiplier = taken(memory.multiplier, batch.members, 0.0)
             copies, drift = (jnp.moveaxis(taken(each, rows, 0.0), 1, -1) for each in (y, memory.drift))
             mine = Memory(copies, drift, multiplier, *(leaf[agents] for leaf in memory[3:]))
             p = shared.shape[1]
@@ -155,8 +156,8 @@ def _normal(x: Array, units: Units) -> Array:
 
 
 def _lanes(batch: Batch, units: Units, gains: Gains, exact: bool) -> Lanes:
-    n, count = batch.rows.shape[1:]
-    return Lanes(batch, jax.tree.map(lambda leaf: leaf[0], batch.kinds), units, gains.cap, (n, len(units.center), count), exact)
+    n, count = batch.rows.shape
+    return Lanes(batch, units, gains.cap, (n, len(units.center), count), exact)
 
 
 def _out(memory: Memory) -> Memory:

@@ -17,7 +17,7 @@ from jax import Array
 
 from consat.numerics import on_device
 from consat.problem.units import Scale
-from consat.protocols.local.interior.layout import Batch, Form, Kind
+from consat.protocols.local.interior.batches import Batch, Form, Kind
 from consat.protocols.local.lanewise import along, arguments, eigen
 
 
@@ -47,11 +47,10 @@ class Units(NamedTuple):
 
 @dataclass(frozen=True)
 class Lanes:
-    """The constraints of the agents of one chunk; m below includes the cap.
+    """The constraints of the agents of one batch; m below includes the cap.
 
     Attributes:
-        batch: static properties of the agents; its arrays are not used.
-        kinds: the constraints, without the axis of chunks.
+        batch: the agents and their constraints.
         units: see `Units`.
         cap: upper bound on the level, in units of ψ; None without a cap.
         shape: (n, d, A).
@@ -59,7 +58,6 @@ class Lanes:
     """
 
     batch: Batch
-    kinds: tuple[Kind, ...]
     units: Units
     cap: float | None
     shape: tuple[int, int, int]
@@ -99,7 +97,7 @@ class Lanes:
     @property
     def used(self) -> Array:
         """(m, A) false where padded."""
-        own = jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *(kind.used for kind in self.kinds)])
+        own = jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *(kind.used for kind in self.batch.kinds)])
         return jnp.concatenate([own, own.any(axis=0, keepdims=True) & (self.cap is not None)])
 
     def psi(self, y: Array) -> Array:
@@ -159,7 +157,7 @@ class Lanes:
         return jnp.any(jnp.stack([jnp.zeros(self.shape[2], bool), *found]), axis=0)
 
     def _each(self) -> Any:
-        return zip(self.batch.forms, self.kinds, strict=True)
+        return zip(self.batch.forms, self.batch.kinds, strict=True)
 
     def _with_cap(self, own: list[Array]) -> Array:
         return jnp.concatenate([*own, jnp.full((1, self.shape[2]), jnp.inf if self.cap is None else self.cap)])

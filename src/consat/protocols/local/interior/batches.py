@@ -1,34 +1,23 @@
-"""Variables of an agent in the interior-point protocol, and the variables that it shares with each neighbour.
-
-An agent's variables are the positions of which it holds copies, and its level. Each position is exchanged along a tree that spans its
-holders. The level is exchanged along a spanning tree of each cluster. So information about a single variable never returns to its sender
-through other agents. Several variables together can still form a loop; where all used links form a tree, they cannot.
-"""
+"""Agents of the interior-point protocol in batches of similar size. The last axis of every array is the agent (the lane), size A."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from consat.numerics import laid_out, on_device
 from consat.problem.constraints.curvature import read_curvatures
-from consat.problem.family import Family, distinct
-from consat.problem.graphs import middles
+from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
+from consat.protocols.local.interior.routes import Shared
 from consat.protocols.local.lanewise import bend_of
-from consat.settings import Layout
-
-Route = Literal["tree", "links"]
-"""How copies are exchanged: ``tree``, all along one spanning tree, or ``links``, over all links, each position along a tree of its own."""
 
 Vectors = tuple[tuple[float, ...], ...]
 
@@ -53,13 +42,13 @@ class Form:
 
 
 class Kind(NamedTuple):
-    """The constraints of one family in a batch, m for each agent with padding. The first axis is the chunk, the last the agent in it.
+    """The constraints of one family in a batch, m for each agent with padding.
 
     Attributes:
-        slots: (chunks, m, arity, A) which of the agent's copies each constraint reads.
-        parameters: name to (chunks, m, …, A).
-        weight: (chunks, m, A).
-        used: (chunks, m, A) false where padded.
+        slots: (m, arity, A) which of the agent's copies each constraint reads.
+        parameters: name to (m, …, A).
+        weight: (m, A).
+        used: (m, A) false where padded.
     """
 
     slots: Array
@@ -74,11 +63,11 @@ class Batch:
     """Agents of similar size: up to n copies, m constraints, g neighbours and p variables shared with a neighbour.
 
     Attributes:
-        agents: (chunks, A) indices of the agents; the last is repeated where a chunk is not full.
-        rows: (chunks, n, A) rows of their copies, their own first; padded with the number of rows.
-        members: (chunks, m, A) indices of their constraints among the multipliers; padded with the number of multipliers.
-        pairs: (chunks, g, A) indices of their ends of links; padded with the number of ends.
-        shared: (chunks, g, p, A) indices of the variables shared with each neighbour; the level is number n·d; padded with n·d + 1.
+        agents: (A,) indices of the agents.
+        rows: (n, A) rows of their copies, their own first; padded with the number of rows.
+        members: (m, A) indices of their constraints among the multipliers; padded with the number of multipliers.
+        pairs: (g, A) indices of their ends of links; padded with the number of ends.
+        shared: (g, p, A) indices of the variables shared with each neighbour; the level is number n·d; padded with n·d + 1.
         kinds: their constraints, one entry per family.
         forms: static properties of these families.
         families: for each kind the index of its family in the team, and of its first multiplier.
@@ -97,8 +86,8 @@ class Batch:
         """Copy with new constraint parameters. `values`: for each family the parameters to replace, (M_f, …)."""
         kinds, start = [], 0
         for kind, (family, offset) in zip(self.kinds, self.families, strict=True):
-            m = kind.used.shape[1]
-            own, members = values[family], self.members[:, start : start + m] - offset
+            m = len(kind.used)
+            own, members = values[family], self.members[start : start + m] - offset
             last = min((len(array) for array in own.values()), default=1) - 1
             kinds.append(kind._replace(parameters={**kind.parameters, **laid_out(own, jnp.clip(members, 0, last))}))
             start += m
@@ -136,138 +125,6 @@ class Plan:
     def with_parameters(self, values: Sequence[Mapping[str, Array]]) -> Plan:
         """Copy with new constraint parameters. `values`: for each family the parameters to replace, (M_f, …)."""
         return replace(self, batches=tuple(batch.with_parameters(values) for batch in self.batches))
-
-
-@dataclass(frozen=True)
-class Shared:
-    """The variables that neighbours share, S in all.
-
-    Attributes:
-        pairs: (P, 2) directed pairs (agent, neighbour), sorted.
-        pair: (S,) index of the pair that shares each variable, sorted.
-        row: (S,) the agent's row of the shared variable, sorted by position within a pair; −1 for the level, which comes last.
-        exact: whether all used links form a tree; see `Plan.exact`.
-    """
-
-    pairs: np.ndarray
-    pair: np.ndarray
-    row: np.ndarray
-    exact: bool
-
-    @classmethod
-    def of(cls, copies: Estimates) -> Shared:
-        """Compute the shared variables of agents with these copies."""
-        count = len(copies.own)
-        here, there = _tree(copies.count, copies.edges, copies.own)
-        talk = copies.holder[copies.edges].astype(np.int64)
-        keys = copies.holder[here].astype(np.int64) * count + copies.holder[there]
-        span = spanning_tree(count, copies.links)
-        level = np.concatenate([span[:, 0].astype(np.int64) * count + span[:, 1], span[:, 1].astype(np.int64) * count + span[:, 0]])
-        pairs = distinct(talk[:, 0] * count + talk[:, 1])
-        pair = np.searchsorted(pairs, np.concatenate([keys, level]))
-        position = np.concatenate([copies.position[here], np.full(len(level), count)])
-        row = np.concatenate([here, np.full(len(level), -1)])
-        order = np.lexsort((position, pair))
-        directed = np.stack(np.divmod(pairs, max(count, 1)), axis=1).astype(np.int32)
-        return cls(directed, pair[order], row[order], len(pairs) == 2 * _tree_links(copies))
-
-    @property
-    def level(self) -> np.ndarray:
-        """(P,) which pairs share the level."""
-        found = np.zeros(len(self.pairs), dtype=bool)
-        found[self.pair[self.row < 0]] = True
-        return found
-
-    def sizes(self, dimension: int) -> np.ndarray:
-        """(P,) number of scalar variables that each pair shares. `dimension`: d."""
-        width = np.where(self.row < 0, 1, dimension)
-        return np.bincount(self.pair, weights=width, minlength=len(self.pairs)).astype(np.int64)
-
-
-def _tree(rows: int, edges: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of trees that span the copies of each position, in both directions, found by breadth-first search from the owner.
-
-    Args:
-        rows: number of copies.
-        edges: (E, 2) edges between copies of the same position, in both directions.
-        own: (N,) rows of own positions.
-    """
-    root = np.full(len(own), rows)
-    here, there = np.concatenate([edges[:, 0], root, own]), np.concatenate([edges[:, 1], own, root])
-    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(rows + 1, rows + 1)).tocsr()
-    order, parent = breadth_first_order(graph, rows, directed=True)
-    child = order[parent[order] >= 0]
-    child = child[parent[child] < rows]
-    up = parent[child]
-    return np.concatenate([child, up]), np.concatenate([up, child])
-
-
-def spanning_tree(count: int, links: np.ndarray) -> np.ndarray:
-    """(L', 2) links of a breadth-first spanning tree of every component, rooted at a central agent.
-
-    Args:
-        count: number of agents N.
-        links: (L, 2).
-    """
-    middle = middles(count, links)
-    here = np.concatenate([links[:, 0], links[:, 1], np.full(len(middle), count)])
-    there = np.concatenate([links[:, 1], links[:, 0], middle])
-    graph = coo_array((np.ones(len(here), dtype=np.int8), (here, there)), shape=(count + 1, count + 1)).tocsr()
-    order, parent = breadth_first_order(graph, count, directed=True)
-    child = order[1:]
-    child = child[parent[child] < count]
-    found = np.sort(np.stack([child, parent[child]], axis=1), axis=1).astype(np.int32)
-    return found[np.lexsort((found[:, 1], found[:, 0]))]
-
-
-def _tree_links(copies: Estimates) -> int:
-    """Number of links if every cluster is a tree."""
-    return len(copies.own) - 1 - int(copies.cluster.max(initial=-1))
-
-
-WIDE = 64
-"""Largest number of shared scalars per pair for which a spanning tree is used. Measured on one core: a round with 57 scalars and 50 agents
-takes 57 ms, with 65 scalars and 100 agents 95 ms; over the links 10 ms and 34 ms."""
-
-
-class Way(NamedTuple):
-    """How the copies of a team are exchanged.
-
-    Attributes:
-        route: along one spanning tree, or over the links.
-        copies: layout of the copies on this route.
-        why: reason for this route.
-        then: layout along a spanning tree, to which a team on route ``links`` switches if it is not satisfied in time; None without one.
-    """
-
-    route: Route
-    copies: Estimates
-    why: str
-    then: Estimates | None = None
-
-
-def route_of(team: Team, layout: Layout, *, exact: bool = True) -> Way:
-    """Choose how the copies of a team are exchanged. Along a tree the steps are exact and the team proves its bound. Over links with loops
-    a satisfying formation is found in fewer rounds, but the smallest violation is often not found and never proven.
-
-    Args:
-        team: team with connected clusters.
-        layout: layout of the estimates.
-        exact: whether to use a spanning tree from the start where the links form loops, if no pair shares more than `WIDE` scalars on it.
-    """
-    along_links = Estimates.of(team, layout)
-    if len(along_links.links) == _tree_links(along_links):
-        return Way("tree", along_links, "the links form a tree")
-    tree = team.with_links(spanning_tree(team.count, along_links.links))
-    along_tree = Estimates.of(tree, layout)
-    width = int(Shared.of(along_tree).sizes(team.dimension).max(initial=0))
-    if width > WIDE:
-        why = f"the links form loops, and over a spanning tree neighbours would share {width} numbers, more than {WIDE}"
-        return Way("links", along_links, why)
-    if exact:
-        return Way("tree", along_tree, f"a spanning tree is narrow enough: neighbours share at most {width} numbers")
-    why = f"the links form loops; a team not satisfied in time goes over to a spanning tree, where neighbours share at most {width} numbers"
-    return Way("links", along_links, why, along_tree)
 
 
 ALIKE = 2**19
@@ -372,17 +229,19 @@ def _made(team: Team, copies: Estimates, shared: Shared, forms: list[Form], star
         held = slot[copies.rows(family.owner[:, None], family.agents)]  # (M_f, arity)
         slots = np.where(used[:, None, :], np.moveaxis(held[filled], -1, 1), 0)
         kinds.append(Kind(
-            on_device(slots.astype(np.int32)[None]),
-            {key: on_device(np.moveaxis(np.asarray(value)[filled], 1, -1)[None]) for key, value in family.parameters.items()},
-            on_device(np.asarray(family.weight)[filled][None]),
-            on_device(used[None]),
+            on_device(slots.astype(np.int32)),
+            {key: on_device(np.moveaxis(np.asarray(value)[filled], 1, -1)) for key, value in family.parameters.items()},
+            on_device(np.asarray(family.weight)[filled]),
+            on_device(used),
         ))  # fmt: skip
         kept.append(form)
         families.append((number, offset))
         members.append(np.where(used, offset + index, start[-1]).astype(np.int32))
     stacked = np.concatenate([np.zeros((0, A), dtype=np.int32), *members])
-    arrays = [on_device(each[None]) for each in (agents.astype(np.int32), rows, stacked, pairs, variables)]
-    return Batch(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], tuple(kinds), tuple(kept), tuple(families))
+    return Batch(
+        on_device(agents.astype(np.int32)), on_device(rows), on_device(stacked), on_device(pairs), on_device(variables),
+        tuple(kinds), tuple(kept), tuple(families),
+    )  # fmt: skip
 
 
 def form_of(family: Family, dimension: int) -> Form:
