@@ -63,7 +63,7 @@ def test_a_torn_team_goes_over_to_a_spanning_tree_and_proves_that_it_is(tmp_path
     assert np.array_equal(went_on.data["position"], result.data["position"])
 
     # where the tree is too wide it stays on its links, and says that it didn't come to rest
-    monkeypatch.setattr("consat.protocols.local.interior.layout.WIDE", 3)
+    monkeypatch.setattr("consat.protocols.local.interior.routes.WIDE", 3)
     wide = cs.run(team, seed=1, rounds=30, stop="satisfied").summary
     assert (wide["route"], wide["known"]) == ("links", None)
     assert "more than 3" in wide["why"]

@@ -241,7 +241,7 @@ def test_loops_narrow_enough_are_cut_open_and_wide_ones_proven_by_nobody(monkeyp
     assert route == "tree"
     assert route_of(team, "local", exact=False).route == "links"
     assert Interior.of(team, copies, scale(team)).plan.exact
-    monkeypatch.setattr("consat.protocols.local.interior.layout.WIDE", 3)
+    monkeypatch.setattr("consat.protocols.local.interior.routes.WIDE", 3)
     route, copies, why, _ = route_of(team, "local")
     assert route == "links"
     assert "more than 3" in why

@@ -101,7 +101,7 @@ class Part:
         reach: half width of the region on each axis, length; see `consat.problem.units.Region`.
         convex: whether every ψ of the team is proven concave.
         exact: whether the agents can prove bounds, because all used links form a tree; see
-            `consat.protocols.local.interior.layout.Plan`.
+            `consat.protocols.local.interior.batches.Plan`.
         hops: largest number of links between two agents.
         team: a team of the agents whose positions this agent holds, in which only this agent has constraints.
         settings: protocol and smoothing.
