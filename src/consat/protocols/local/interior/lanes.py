@@ -8,11 +8,12 @@ most `cap`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from consat.numerics import on_device
@@ -45,6 +46,7 @@ class Units(NamedTuple):
         return cls(*map(on_device, values))
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Lanes:
     """The constraints of the agents of one batch; m below includes the cap.
@@ -59,9 +61,9 @@ class Lanes:
 
     batch: Batch
     units: Units
-    cap: float | None
-    shape: tuple[int, int, int]
-    exact: bool
+    cap: float | None = field(metadata={"static": True})
+    shape: tuple[int, int, int] = field(metadata={"static": True})
+    exact: bool = field(metadata={"static": True})
 
     @property
     def any_moves(self) -> bool:
@@ -100,6 +102,7 @@ class Lanes:
         own = jnp.concatenate([jnp.zeros((0, self.shape[2]), bool), *(kind.used for kind in self.batch.kinds)])
         return jnp.concatenate([own, own.any(axis=0, keepdims=True) & (self.cap is not None)])
 
+    @jax.jit
     def psi(self, y: Array) -> Array:
         """(m, A) ψ at the copies `y`, (n, d, A), the cap last; −∞ outside the domain of ψ, +∞ where padded."""
         own = [self._masked(kind, along(_at(form.psi))(self._arguments(kind, y), kind.parameters)) for form, kind in self._each()]
@@ -116,40 +119,51 @@ class Lanes:
         n, d, count = self.shape
         return self._with_cap(values), jnp.concatenate([*gradients, jnp.zeros((1, n * d, count))])
 
-    def bends(self, y: Array, quadratic: bool = False) -> tuple[Array, Array, Array]:
-        """Curvature of the constraints as r rank-one terms: Σ w λ v vᵀ is the convex part of −Σ_k λ_k ∇²ψ_k.
+    def terms(self, *, quadratic: bool = False) -> np.ndarray:
+        """(r,) the constraint of each term of `bends`."""
+        found, done = [], 0
+        for form, kind in self._each():
+            m, arity, _ = kind.slots.shape
+            found += [done + k for k in range(m) for _ in range(self._rank(form, arity, quadratic))]
+            done += m
+        return np.array(found, dtype=int)
+
+    def bends(self, y: Array, *, quadratic: bool = False) -> tuple[Array, Array]:
+        """Curvature of the constraints as r rank-one terms: Σ w λ v vᵀ is the convex part of −Σ_k λ_k ∇²ψ_k, with the λ_k of `terms`.
 
         Args:
             y: (n, d, A) copies.
             quadratic: whether to include only quadratic ψ, whose curvature is the same everywhere.
 
         Returns:
-            (r,) the constraint of each term, (r, A) weights w, and (r, n·d, A) vectors v.
+            (r, A) weights w, and (r, n·d, A) vectors v.
         """
         n, d, count = self.shape
-        which, weights, vectors, done = [], [jnp.zeros((0, count))], [jnp.zeros((0, n * d, count))], 0
+        weights, vectors = [jnp.zeros((0, count))], [jnp.zeros((0, n * d, count))]
         for form, kind in self._each():
             m, arity, _ = kind.slots.shape
-            scale = jnp.where(kind.used, kind.weight * self.units.length**2 / self.units.psi, 0.0)
+            rank = self._rank(form, arity, quadratic)
+            if not rank:
+                continue
             if form.curvature is not None:
-                rank = len(form.curvature)
                 values = jnp.ones((m, rank, count))
                 found = jnp.broadcast_to(jnp.asarray(form.curvature).reshape(rank, arity, d, 1), (m, rank, arity, d, count))
-            elif quadratic and not form.quadratic:
-                rank, values, found = 0, jnp.zeros((m, 0, count)), jnp.zeros((m, 0, arity, d, count))
             else:
-                rank = arity * d
                 minus = along(_minus_hessian(form.psi, arity, d))(self._arguments(kind, y), kind.parameters)  # (m, N, N, A)
                 eigenvalues, eigenvectors = eigen(jnp.moveaxis(minus, 0, -2).reshape(rank, rank, m * count))
                 values = jnp.moveaxis(jnp.maximum(eigenvalues, 0.0).reshape(rank, m, count), 1, 0)
                 found = eigenvectors.T.reshape(m, count, rank, arity, d).transpose(0, 2, 3, 4, 1)
-            if rank:
-                rows = jnp.repeat(kind.slots, rank, axis=0, total_repeat_length=m * rank)
-                which += [done + k for k in range(m) for _ in range(rank)]
-                weights.append((scale[:, None] * values).reshape(m * rank, count))
-                vectors.append(self._placed(kind._replace(slots=rows), found.reshape(m * rank, arity, d, count)))
-            done += m
-        return jnp.asarray(which, dtype=int), jnp.concatenate(weights), jnp.concatenate(vectors)
+            scale = jnp.where(kind.used, kind.weight * self.units.length**2 / self.units.psi, 0.0)
+            rows = jnp.repeat(kind.slots, rank, axis=0, total_repeat_length=m * rank)
+            weights.append((scale[:, None] * values).reshape(m * rank, count))
+            vectors.append(self._placed(kind._replace(slots=rows), found.reshape(m * rank, arity, d, count)))
+        return jnp.concatenate(weights), jnp.concatenate(vectors)
+
+    def _rank(self, form: Form, arity: int, quadratic: bool) -> int:
+        """Number of terms of a constraint in `bends`."""
+        if form.curvature is not None:
+            return len(form.curvature)
+        return 0 if quadratic and not form.quadratic else arity * self.shape[1]
 
     def _any(self, which: Callable[[Form], bool]) -> Array:
         """(A,) whether an agent has a constraint of such a form."""
@@ -188,11 +202,17 @@ class Here(NamedTuple):
 
     psi: Array
     slopes: Array
-    bends: tuple[Array, Array, Array]
+    bends: tuple[Array, Array]
 
     @classmethod
     def of(cls, lanes: Lanes, y: Array) -> Here:
-        return cls(*lanes.slopes(y), lanes.bends(y))
+        """At the copies `y`, (n, d, A)."""
+        return _here(lanes, y)
+
+
+@jax.jit  # so that it is traced once, although a round needs it twice
+def _here(lanes: Lanes, y: Array) -> Here:
+    return Here(*lanes.slopes(y), lanes.bends(y))
 
 
 def _at(psi: Any) -> Any:

@@ -67,7 +67,7 @@ def prove(lanes: Lanes, shared: Array, held: Array, y: Array, *, here: Here, mul
         return Proof(jnp.zeros((g, p, p, count)), jnp.zeros((g, p, count)), zero, zero - 1.0, zero), jnp.full(count, jnp.inf)
     used, flat = lanes.used[:-1] & (here.psi[:-1] > -jnp.inf), y.reshape(size, count)
     psi, slopes, multiplier = jnp.where(used, here.psi[:-1], 0.0), here.slopes[:-1], jnp.where(used, multiplier[:-1], 0.0)
-    which, weights, vectors = lanes.bends(y, quadratic=True)
+    which, (weights, vectors) = lanes.terms(quadratic=True), lanes.bends(y, quadratic=True)
     matrix = gram(weights * multiplier[which], vectors) if len(which) else jnp.zeros((size, size, count))
     weight, value, slope = jnp.sum(multiplier, axis=0), jnp.sum(multiplier * psi, axis=0), jnp.sum(multiplier[:, None] * slopes, axis=0)
     bent = times(matrix, flat)

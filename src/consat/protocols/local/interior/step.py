@@ -5,6 +5,7 @@ The variables of an agent are its n·d coordinates, then its level. Units are th
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -114,7 +115,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
     point = point._replace(warm=rest > 0)
     proof, bound = prove(lanes, shared, held, y, here=here, multiplier=point.multiplier, inbox=proofs)
     speaks = (lanes.used[:-1].any(axis=0) | jnp.isfinite(lowest)) & ~point.warm
-    left, e = summary(here, y, point, theirs, shared=shared, inbox=inbox, gains=gains)
+    left, e = summary(lanes, here, y, point, theirs, shared=shared, inbox=inbox, gains=gains)
     every = jnp.zeros(inbox.level.shape)
     mail = Mail(
         left,
@@ -162,7 +163,7 @@ def moved(
     y, (outside, pull) = memory.y, theirs
     n, d, count = y.shape
     level, s, multiplier, barrier, used, warm, _ = point
-    matrix, gradient = model(here, point, gains)
+    matrix, gradient = model(lanes, here, point, gains.inertia, warm=gains.warm > 0)
     flat = jnp.concatenate([y.reshape(n * d, count), level[None]])
     step, _ = solve(matrix + outside, (pull - gradient - times(outside, flat))[:, None])
     step = jnp.where(jnp.isfinite(step).all(axis=(0, 1)), step[:, 0], 0.0)
@@ -218,12 +219,12 @@ def renewed(lanes: Lanes, here: Here, point: Point, inbox: Mail, gains: Gains) -
 
 
 def summary(
-    here: Here, y: Array, point: Point, theirs: tuple[Array, Array], *, shared: Array, inbox: Mail, gains: Gains
+    lanes: Lanes, here: Here, y: Array, point: Point, theirs: tuple[Array, Array], *, shared: Array, inbox: Mail, gains: Gains
 ) -> tuple[Array, Array]:
     """(g, p, p, A) and (g, p, A) the quadratic for each neighbour: all that the agent knows except what this neighbour has sent, minimised
     over the variables not shared with it. 0 where it has no minimum."""
     size, (outside, pull) = y.shape[0] * y.shape[1] + 1, theirs
-    matrix, gradient = model(here, point, gains)
+    matrix, gradient = model(lanes, here, point, gains.inertia, warm=gains.warm > 0)
     flat = jnp.concatenate([y.reshape(size - 1, -1), point.level[None]])
     left, e, _, fine = reduced(matrix + outside, times(matrix, flat) - gradient + pull, shared)
     left, e = left - inbox.matrix, e - inbox.vector
@@ -242,27 +243,28 @@ def _least_of_others(numbers: Array) -> Array:
     return jnp.where(mine, second[None], least[None])
 
 
-def model(here: Here, point: Point, gains: Gains) -> tuple[Array, Array]:
+@functools.partial(jax.jit, static_argnames="warm")
+def model(lanes: Lanes, here: Here, point: Point, stiffness: Array | float, *, warm: bool) -> tuple[Array, Array]:
     """(N, N, A) matrix M and (N, A) gradient g of the Newton step. Where `point.warm`, they are those of the mean of the margins, and the
-    level is not a variable."""
-    _, s, multiplier, barrier, used, warm, inertia = point
+    level is not a variable. `stiffness`: the gain `inertia`; `warm`: whether any agent may be warm."""
+    _, s, multiplier, barrier, used, warms, inertia = point
     count = s.shape[-1]
     some = used[:-1].any(axis=0)
-    which, weights, vectors = here.bends
+    which, (weights, vectors) = lanes.terms(), here.bends
     rows = jnp.concatenate([here.slopes, jnp.where(used, -1.0, 0.0)[:, None]], axis=1)
     pressed, stiff = jnp.where(used, barrier[None] / s, 0.0), jnp.where(used, multiplier / s, 0.0)
-    if gains.warm:
+    if warm:
         share = jnp.where(used, 1.0 / jnp.maximum(number(used[:-1]), 1.0)[None], 0.0)
         share = jnp.concatenate([share[:-1], jnp.zeros((1, count))])
-        pressed, stiff, multiplier = (jnp.where(warm[None], a, b) for a, b in ((share, pressed), (0.0, stiff), (share, multiplier)))
+        pressed, stiff, multiplier = (jnp.where(warms[None], a, b) for a, b in ((share, pressed), (0.0, stiff), (share, multiplier)))
     bent = gram(weights * multiplier[which], vectors) if len(which) else jnp.zeros((rows.shape[1] - 1, rows.shape[1] - 1, count))
     matrix = gram(stiff, rows) + jnp.pad(bent, ((0, 1), (0, 1), (0, 0)))
     gradient = -jnp.sum(pressed[:, None] * rows, axis=0)
     gradient = gradient.at[-1].add(jnp.where(some, -1.0, 0.0))
-    gradient = gradient.at[-1].set(jnp.where(warm, 0.0, gradient[-1]))
+    gradient = gradient.at[-1].set(jnp.where(warms, 0.0, gradient[-1]))
     trace = jnp.trace(matrix)  # independent of the padding, whose entries are 0
-    still = jnp.where(warm, 1e-6, inertia * gains.inertia) + 1e-12 * trace
-    own = jnp.where(warm, 1.0, 1e-9 * matrix[-1, -1] + jnp.where(some, 0.0, 1e-9))
+    still = jnp.where(warms, 1e-6, inertia * stiffness) + 1e-12 * trace
+    own = jnp.where(warms, 1.0, 1e-9 * matrix[-1, -1] + jnp.where(some, 0.0, 1e-9))
     last = jnp.arange(len(matrix))[:, None] == len(matrix) - 1
     return matrix + jnp.eye(len(matrix))[:, :, None] * jnp.where(last, own[None], still[None])[:, None], gradient
 
@@ -287,7 +289,7 @@ def length_of(lanes: Lanes, here: Here, point: Point, flat: Array, step: Array, 
     way, away = (jnp.max(jnp.abs(each[:-1]), axis=0, initial=0.0) for each in (step, flat))
     most = jnp.where(lanes.concave, jnp.inf, lanes.units.reach + away)
     first, second = jnp.sum(here.slopes * step[None, :-1], axis=1), jnp.zeros(used.shape)
-    which, weights, vectors = here.bends
+    which, (weights, vectors) = lanes.terms(), here.bends
     if len(which):
         second = second.at[which].add(weights * jnp.sum(vectors * step[None, :-1], axis=1) ** 2)
 
