@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -21,14 +18,7 @@ from consat.cli.export import export, result_argument, show
 from consat.cli.keys import keys
 from consat.cli.live import live
 from consat.cli.network import agent, launch, split
-from consat.cli.schema import schema
-from consat.cli.terminal import (
-    DONE,
-    FAILED,
-    INTERRUPTED,
-    INVALID,
-    UNSATISFIED,
-    USAGE,
+from consat.cli.options import (
     Burst,
     Listing,
     OneOf,
@@ -37,22 +27,31 @@ from consat.cli.terminal import (
     force_option,
     full_option,
     json_option,
-    located,
     out_option,
     scenario_argument,
     sends_option,
     set_option,
-    tell,
     words,
+)
+from consat.cli.schema import schema
+from consat.cli.terminal import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    INVALID,
+    UNSATISFIED,
+    USAGE,
+    located,
+    progress,
+    say,
+    show_rich,
+    tell,
 )
 from consat.errors import ConsatError, InvalidInput, InvalidSettings, closest
 from consat.network.deploy.environment import keep_compilations
 
 if TYPE_CHECKING:
     from consat.scenario import Scenario
-
-PATIENCE = 2000
-"""Default limit of a run, in rounds or in seconds of a flow."""
 
 
 def main() -> NoReturn:
@@ -70,19 +69,19 @@ def main() -> NoReturn:
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except InvalidInput as error:
-        _complain(str(error))
+        say(str(error))
         sys.exit(INVALID)
     except InvalidSettings as error:
-        _complain(f"consat: {error}")
+        say(f"consat: {error}")
         sys.exit(USAGE)
     except ConsatError as error:
-        _complain(f"consat: {error}")
+        say(f"consat: {error}")
         sys.exit(FAILED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
     except OSError as error:
-        _complain(f"consat: {error.filename or ''}: {error.strerror or error}")
+        say(f"consat: {error.filename or ''}: {error.strerror or error}")
         sys.exit(FAILED)
     finally:
         gc.freeze()  # skips the garbage collection of all of JAX at exit
@@ -162,7 +161,8 @@ def _names(context: click.Context, parameter: click.Parameter, value: str | None
               help="Integrates the bodies of robots: {}; by default the robots' own models do.")  # fmt: skip
 @sends_option
 @click.option("--auxiliary", type=click.FloatRange(min=0, min_open=True), metavar="RADIUS", help="Keep every agent in this ball, too.")
-@click.option("--restarts", type=click.IntRange(min=1), metavar="K", help="Run from K starts, and tell of the best.")
+@click.option("--restarts", type=click.IntRange(min=1), metavar="K",
+              help="Run from K starts, and tell of the best; by default 1, then 5 if constraints of mixed curvature fail.")  # fmt: skip
 @out_option
 @force_option
 @click.option("--every", type=click.IntRange(min=1), default=1, metavar="K", help="Record each K-th round, or sample of a flow.")
@@ -190,7 +190,7 @@ def run(
     scenario: str | None, overrides: tuple[str, ...], resume: Path | None, full: bool, quiet: bool, as_json: bool, **settings: Any
 ) -> int:  # fmt: skip
     """Run the distributed protocol."""
-    _cache_compilations()
+    keep_compilations(os.environ)
     if not _meet(*(settings.pop(name) for name in ("processes", "coordinator", "process", "of"))):
         quiet, as_json = True, False  # only process 0 prints
     out = settings["out"] = resume or settings["out"]
@@ -198,18 +198,18 @@ def run(
     loaded = None if scenario is None else _load(scenario, overrides)
     from consat.runs import runner
 
-    with _progress(quiet or as_json, settings["rounds"] or settings["until"]) as progress, located(loaded):
+    with progress(quiet or as_json, settings["rounds"] or settings["until"]) as report, located(loaded):
         if loaded is None:
             kept = {key: settings[key] for key in ("rounds", "until", "checkpoint")}
-            result = runner.resume(cast(Path, resume), full=full, progress=progress, **kept)
+            result = runner.resume(cast(Path, resume), full=full, progress=report, **kept)
         else:
-            result = runner.run(loaded, full=full, progress=progress, **settings)
+            result = runner.run(loaded, full=full, progress=report, **settings)
     if settings["auxiliary"] is not None:
         _say_auxiliary(settings["auxiliary"], result.binding("auxiliary"))
     if result.summary["result"] is not None and out is not None:
         figures = result.plot(out)
         if not (quiet or as_json):
-            _say(f"written: {', '.join(map(str, (result.summary['result'], *figures)))}")
+            say(f"written: {', '.join(map(str, (result.summary['result'], *figures)))}")
     return tell(result, quiet=quiet, as_json=as_json)
 
 
@@ -243,7 +243,7 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
 
     That is its schema, task and communication graph, clusters, the paper's assumptions, and the curvature of every constraint.
     """
-    _cache_compilations()
+    keep_compilations(os.environ)
     loaded = _load(scenario, overrides)
     from consat.certify.assumptions import report
     from consat.problem.graphs import require_connected
@@ -258,7 +258,7 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     if as_json:
         click.echo(json.dumps(findings))
     else:
-        _show(tables.check(loaded.name, findings))
+        show_rich(tables.check(loaded.name, findings))
     with located(loaded):
         require_connected(loaded.team)
     return DONE
@@ -275,7 +275,7 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
 
     Says also what binds, or what stands in the way, and what the least change is that would help.
     """
-    _cache_compilations()
+    keep_compilations(os.environ)
     loaded = _load(scenario, overrides)
     from consat.runs.solving import solve as solve_team
     from consat.views import tables
@@ -287,7 +287,7 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     if as_json:
         click.echo(json.dumps(answer))
     else:
-        _show(tables.solve(answer))
+        show_rich(tables.solve(answer))
     return DONE if answer["verdict"] == "feasible" else UNSATISFIED
 
 
@@ -321,7 +321,7 @@ def sweep(
 
     Runs every combination of the values, each with every seed.
     """
-    _cache_compilations()
+    keep_compilations(os.environ)
     if wrong := [text for text in over if not all(text.partition("="))]:
         raise click.UsageError(
             f"--over {wrong[0]}: this must be PATH=VALUES, such as loss=0,0.1,0.3 or agents.a1.constraints.0.radius=0.5:2:16"
@@ -338,14 +338,14 @@ def sweep(
     if out is not None:
         claim(out, loaded.name, force=force)
     options = {path: values(text.partition("=")[2]) for path, text in zip(paths, over, strict=True)}
-    with _progress(as_json, share=True) as progress, located(loaded):
-        found = sweep_team(loaded, options, progress=progress, **settings)
+    with progress(as_json, share=True) as report, located(loaded):
+        found = sweep_team(loaded, options, progress=report, **settings)
     if out is not None:
-        _say(f"written: {', '.join(map(str, found.save(out)))}")
+        say(f"written: {', '.join(map(str, found.save(out)))}")
     if as_json:
         click.echo(json.dumps(found.summary))
     else:
-        _show(tables.sweep(found.summary))
+        show_rich(tables.sweep(found.summary))
     return DONE if all(group["success"] == 1 for group in found.summary["groups"]) else UNSATISFIED
 
 
@@ -354,7 +354,7 @@ def sweep(
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Where to; beside the result if not given.")
 def plot(result: Path, out: Path | None) -> None:
     """Draw the figures of a saved RESULT, a file or the DIR of a run."""
-    _cache_compilations()
+    keep_compilations(os.environ)
     from consat.results.result import Result
 
     for path in Result.load(result).plot(out or _file(result).parent):
@@ -367,13 +367,13 @@ def plot(result: Path, out: Path | None) -> None:
               help="Where to, one of {}; a GIF beside the result if not given.")  # fmt: skip
 def animate(result: Path, out: Path | None) -> None:
     """Make a film of a saved RESULT, a file or the DIR of a run."""
-    _cache_compilations()
+    keep_compilations(os.environ)
     from consat.results.result import Result
     from consat.views import animation
 
     loaded = Result.load(result)
-    with _progress(quiet=False) as progress:
-        click.echo(animation.save(loaded, out or _file(result).with_suffix(".gif"), progress=lambda done: progress(done, None)))
+    with progress(quiet=False) as report:
+        click.echo(animation.save(loaded, out or _file(result).with_suffix(".gif"), progress=lambda done: report(done, None)))
 
 
 def _file(result: Path) -> Path:
@@ -394,63 +394,8 @@ def _load(scenario: str, overrides: tuple[str, ...]) -> Scenario:
     return load(scenario, overrides)
 
 
-def _cache_compilations() -> None:
-    """Keep compiled programs between runs, in the user's cache directory. Must be called before JAX starts."""
-    os.environ.setdefault("EQX_ON_ERROR", "nan")  # the error callback of Equinox prevents caching; results carry their own status
-    keep_compilations(os.environ)
-
-
-@contextmanager
-def _progress(quiet: bool, total: float | None = None, *, share: bool = False) -> Iterator[Callable[[float, float | None], None]]:
-    """Progress bar on stderr, if that is a terminal. Yields a function of the fraction done and the margin.
-
-    Args:
-        quiet: whether to show nothing.
-        total: number of rounds, or seconds of a flow, for the displayed rate; `PATIENCE` if None.
-        share: whether the second argument is the fraction of satisfied runs instead of the margin.
-    """
-    if quiet or not sys.stderr.isatty():
-        yield lambda *_: None
-        return
-    import time
-
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[said]}")
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("run", total=1.0, said="compiling …")
-        first: list[tuple[float, float]] = []
-
-        def update(done: float, margin: float | None) -> None:
-            first.append((time.perf_counter(), done)) if not first else None
-            since, before = first[0]
-            per_second = (done - before) * (total or PATIENCE) / max(time.perf_counter() - since, 1e-9)
-            rate = f"{per_second:,.0f}/s   " if margin is not None and done > before else ""
-            said = "" if margin is None else f"{margin:.0%} satisfied" if share else f"{rate}margin {margin:+.4g}"
-            bar.update(task, completed=done, said=said)
-
-        yield update
-
-
 def _say_auxiliary(radius: float, binding: list[str]) -> None:
-    _say(f"auxiliary constraint added: every agent stays within {radius:g} of the team's middle")
+    say(f"auxiliary constraint added: every agent stays within {radius:g} of the team's middle")
     if binding:
         few = ", ".join(binding[:5]) + (", …" if len(binding) > 5 else "")
-        _say(f"it binds on {few}: the answer is that of the changed team; take a larger radius")
-
-
-def _show(parts: Iterable[Any]) -> None:
-    """Print rich text on stdout; with a fixed width of 160 characters if stdout is not a terminal."""
-    from rich.console import Console
-
-    console = Console() if sys.stdout.isatty() else Console(width=160)
-    for part in parts:
-        console.print(part, highlight=False, soft_wrap=isinstance(part, str))
-
-
-def _say(text: str) -> None:
-    click.echo(text, err=True)
-
-
-_complain = functools.partial(click.echo, err=True)
+        say(f"it binds on {few}: the answer is that of the changed team; take a larger radius")

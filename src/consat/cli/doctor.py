@@ -15,7 +15,8 @@ from typing import Any, Final
 import click
 
 from consat import __version__
-from consat.cli.terminal import DONE, FAILED, json_option
+from consat.cli.options import json_option
+from consat.cli.terminal import DONE, FAILED
 from consat.network.deploy.environment import keep_compilations
 
 SCHEMA: Final = "consat.doctor/1"

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from consat.cli.completion import results
-from consat.cli.terminal import Listing, films
+from consat.cli.options import Listing, films
 from consat.network.deploy.environment import keep_compilations
 
 result_argument = click.argument("result", type=click.Path(path_type=Path), shell_complete=results)

@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from consat.cli.terminal import Listing, located, scenario_argument, set_option
+from consat.cli.options import Listing, scenario_argument, set_option
+from consat.cli.terminal import located
 from consat.network.deploy.environment import keep_compilations
 
 

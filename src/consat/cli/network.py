@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from consat.cli.completion import agents, protocols
-from consat.cli.terminal import (
-    DONE,
+from consat.cli.options import (
     Burst,
     Listing,
     OneOf,
@@ -18,14 +17,13 @@ from consat.cli.terminal import (
     force_option,
     full_option,
     json_option,
-    located,
     out_option,
     scenario_argument,
     sends_option,
     set_option,
-    tell,
     words,
 )
+from consat.cli.terminal import DONE, located, tell
 from consat.errors import counted
 from consat.network.deploy.environment import prepare_own
 

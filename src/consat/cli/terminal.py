@@ -1,17 +1,15 @@
-"""Shared by all commands: arguments, options, exit codes, and the printing of a result."""
+"""What commands print and how they end: exit codes, results, progress, messages."""
 
 from __future__ import annotations
 
-import importlib
 import json
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from consat.cli.completion import scenarios
 from consat.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -19,81 +17,8 @@ if TYPE_CHECKING:
     from consat.scenario import Scenario
 
 DONE, FAILED, USAGE, INVALID, UNSATISFIED, INTERRUPTED = 0, 1, 2, 3, 4, 130
-
-
-class Burst(click.ParamType[tuple[float, float]]):
-    """Type of an option: two probabilities ``P,Q``."""
-
-    name = "P,Q"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        try:
-            p, q = value if isinstance(value, tuple) else map(float, str(value).split(","))
-        except ValueError:
-            self.fail(f"it is {value!r}, but must be two probabilities, such as 0.05,0.5", param, ctx)
-        return p, q
-
-
-class OneOf(click.Choice[str]):
-    """Type of an option whose choices stand in a registry. It is imported when the choices are needed, because imports take time.
-
-    Args:
-        listed: returns the choices.
-    """
-
-    def __init__(self, listed: Callable[[], Iterable[str]]) -> None:
-        self._listed, self.case_sensitive = listed, True
-
-    @property
-    def choices(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The names in the registry."""
-        return tuple(self._listed())
-
-
-class Listing(click.Option):
-    """Option whose help lists the names of a registry, in place of ``{}``. The registry is imported when the help is shown.
-
-    Args:
-        listed: returns the names.
-        given: as of `click.Option`.
-        options: as of `click.Option`.
-    """
-
-    def __init__(self, *given: Any, listed: Callable[[], Iterable[str]], **options: Any) -> None:
-        super().__init__(*given, **options)
-        self._listed = listed
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Option and help."""
-        self.help = (self.help or "").format(", ".join(self._listed()))
-        return super().get_help_record(ctx)
-
-
-def words(module: str, of: str) -> Callable[[], Iterable[str]]:
-    """Function that imports a module and returns the values of a literal type of it, or the names in a registry."""
-
-    def listed() -> Iterable[str]:
-        found = getattr(importlib.import_module(module), of)
-        return get_args(found) or found
-
-    return listed
-
-
-films = words("consat.views.animation", "FORMATS")
-scenario_argument = click.argument("scenario", metavar="FILE", shell_complete=scenarios)
-set_option = click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change the scenario, e.g. start.box=[-9,9].")
-estimates_option = click.option(
-    "--estimates", type=OneOf(words("consat.settings", "Layout")), help="Who holds copies: what is needed, or everything."
-)
-sends_option = click.option(
-    "--sends", type=OneOf(words("consat.settings", "Sends")), default="all", help="In every round, or only what is news to a neighbour."
-)
-out_option = click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Write the result and its figures there."
-)
-force_option = click.option("--force", is_flag=True, help="Overwrite results of another scenario in --out.")
-full_option = click.option("--full", is_flag=True, help="List every agent in the JSON, however many.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else.")
+PATIENCE = 2000
+"""Default limit of a run, in rounds or in seconds of a flow."""
 
 
 @contextmanager
@@ -116,3 +41,50 @@ def tell(result: Result, *, quiet: bool, as_json: bool) -> int:
     if result.summary["ending"] == "interrupted":
         return INTERRUPTED
     return {"satisfied": DONE, "diverged": FAILED}.get(result.summary["status"], UNSATISFIED)
+
+
+@contextmanager
+def progress(quiet: bool, total: float | None = None, *, share: bool = False) -> Iterator[Callable[[float, float | None], None]]:
+    """Progress bar on stderr, if that is a terminal. Yields a function of the fraction done and the margin.
+
+    Args:
+        quiet: whether to show nothing.
+        total: number of rounds, or seconds of a flow, for the displayed rate; `PATIENCE` if None.
+        share: whether the second argument is the fraction of satisfied runs instead of the margin.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    import time
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[said]}")
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("run", total=1.0, said="compiling …")
+        first: list[tuple[float, float]] = []
+
+        def update(done: float, margin: float | None) -> None:
+            first.append((time.perf_counter(), done)) if not first else None
+            since, before = first[0]
+            per_second = (done - before) * (total or PATIENCE) / max(time.perf_counter() - since, 1e-9)
+            rate = f"{per_second:,.0f}/s   " if margin is not None and done > before else ""
+            said = "" if margin is None else f"{margin:.0%} satisfied" if share else f"{rate}margin {margin:+.4g}"
+            bar.update(task, completed=done, said=said)
+
+        yield update
+
+
+def show_rich(parts: Iterable[Any]) -> None:
+    """Print rich text on stdout; with a fixed width of 160 characters if stdout is not a terminal."""
+    from rich.console import Console
+
+    console = Console() if sys.stdout.isatty() else Console(width=160)
+    for part in parts:
+        console.print(part, highlight=False, soft_wrap=isinstance(part, str))
+
+
+def say(text: str) -> None:
+    """Print a message on stderr."""
+    click.echo(text, err=True)

@@ -40,11 +40,13 @@ def prepare_own(*, exact: bool) -> None:
 
 
 def keep_compilations(environment: MutableMapping[str, str]) -> None:
-    """Enable JAX's cache of compiled programs, in the user's cache directory unless another directory is set."""
+    """Enable JAX's cache of compiled programs, in the user's cache directory unless another directory is set. Must be called before JAX
+    starts."""
     if "JAX_COMPILATION_CACHE_DIR" not in environment:
         home = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         environment["JAX_COMPILATION_CACHE_DIR"] = str(home / "consat" / "xla")
     if environment.get(_LOG_LEVEL, _OF_JAX) == _OF_JAX:
         environment[_LOG_LEVEL] = "3"  # for each cached program, XLA would log a false warning of 2 KiB about another machine
+    environment.setdefault("EQX_ON_ERROR", "nan")  # the error callback of Equinox prevents caching; results carry their own status
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
