@@ -24,10 +24,8 @@ from consat.settings import Sends
 ROUNDS = 120
 KILLS = ((0.1, "a2"), (0.8, "a1"))
 TRIALS = {
-    "perfect": ("case-c", "interior-point", 0.0, ()), "loss": ("case-c", "interior-point", 0.3, ()),
-    "kills": ("case-c", "interior-point", 0.3, KILLS), "infeasible": ("case-d", "interior-point", 0.0, ()),
-    "infeasible, loss": ("case-d", "interior-point", 0.3, ()), "max-min": ("case-d", "max-min", 0.3, ()),
-    "admm": ("case-c", "admm", 0.3, KILLS),
+    "kills": ("case-c", "interior-point", 0.3, KILLS), "infeasible": ("case-d", "interior-point", 0.3, ()),
+    "max-min": ("case-d", "max-min", 0.3, ()), "admm": ("case-c", "admm", 0.3, KILLS),
 }  # fmt: skip
 """Scenario, protocol, loss, and who is killed when."""
 EVENTS = {
