@@ -95,7 +95,6 @@ class Drive:
         neighbours: largest number of neighbours with a plane of their own. The others only limit the speed.
         parts: largest number of parts of obstacles with a plane of their own.
         sensing: range of the sensors, m; None for the range that `rules` need.
-        tolerance: distance from its target at which a robot has arrived, m; None for its radius.
         rules: parameters of the rules against deadlock.
 
     Attributes:
@@ -118,7 +117,6 @@ class Drive:
     neighbours: int = 8
     parts: int = 4
     sensing: float | None = None
-    tolerance: float | None = None
     rules: Rules = field(default_factory=Rules)
     map: Map = field(init=False)
     size: np.ndarray = field(init=False)
@@ -146,8 +144,8 @@ class Drive:
 
     @property
     def arrives(self) -> Array:
-        """(N,) distance from its target at which each robot has arrived, m."""
-        return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
+        """(N,) distance from its target at which each robot has arrived, m: its radius."""
+        return each(self.model.radius, self.count)
 
     def start(self, state: Any) -> Memory:
         """The memory at the start. Its types are those after a step, because a weak type would cause a second compilation."""
@@ -240,10 +238,10 @@ class Drive:
 
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
         """Indices of robots that have not arrived and made no progress for `PATIENCE`."""
-        return np.flatnonzero(np.asarray(~self.arrived(state, targets) & (memory.waited > PATIENCE))).tolist()
+        return np.flatnonzero(np.asarray(self.ended(state, memory, targets)[1])).tolist()
 
     def arrived(self, state: Any, targets: Array) -> Array:
-        """(N,) whether each robot is within `tolerance` of its target."""
+        """(N,) whether each robot is at its target; see `arrives`."""
         return jnp.linalg.norm(targets - self.position(state), axis=1) < self.arrives
 
     def position(self, state: Any) -> Array:

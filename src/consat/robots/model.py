@@ -1,4 +1,4 @@
-"""Interface of all robot models, and the check of their parameters.
+"""Interface of all robot models, the two bases that models share, and the check of their parameters.
 
 A model holds parameters only; the state is passed in and returned. All functions compute N robots at once and can be traced by JAX; a
 process of one robot has N = 1. Positions have shape (N, d), in metres; times are in seconds and angles in radians.
@@ -100,6 +100,94 @@ class Model(Protocol, Generic[S]):
 
     def reach(self, state: S, dt: float) -> tuple[Array, Array]:
         """Center (N, d) and radius (N,) of a ball of velocities that can be reached within `dt`."""
+
+
+class Instant(Model[S]):
+    """Base of models that halt at once: what the filter asks follows from `place` and `step`."""
+
+    inertial = False
+    speed: Number
+
+    def stop(self, state: S, dt: float) -> Array:
+        return self.place(state)
+
+    def pace(self, count: int) -> Array:
+        return each(self.speed, count)
+
+    def braking(self, count: int) -> Array:
+        return jnp.full(count, jnp.inf)
+
+    def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
+        return along(normals, self.place(self.step(state, command, dt)))
+
+    def rows(self, state: S, normals: Array, least: Array, dt: float) -> Array:
+        return (least - along(normals, self.place(state))) / dt
+
+    def farthest(self, state: S, command: Array, dt: float) -> Array:
+        return jnp.linalg.norm(self.place(self.step(state, command, dt)) - self.place(state), axis=1)
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        return slack / dt
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        return jnp.minimum(self.pace(len(distance)), distance / (2.0 * dt))
+
+    def reach(self, state: S, dt: float) -> tuple[Array, Array]:
+        place = self.place(state)
+        return jnp.zeros_like(place), self.pace(len(place))
+
+
+class Following(Model[Any]):
+    """Base of models whose bodies follow a reference. Commands move the reference, and the filter keeps references apart.
+
+    Attributes:
+        reference: model of the references. Its state is the entry `reference` of the state.
+    """
+
+    reference: Model[Any]
+
+    @property
+    def inertial(self) -> bool:
+        return self.reference.inertial
+
+    def place(self, state: Any) -> Array:
+        return self.reference.place(state.reference)
+
+    def velocity(self, state: Any, command: Array) -> Array:
+        return self.reference.velocity(state.reference, command)
+
+    def stop(self, state: Any, dt: float) -> Array:
+        return self.reference.stop(state.reference, dt)
+
+    def pace(self, count: int) -> Array:
+        return self.reference.pace(count)
+
+    def braking(self, count: int) -> Array:
+        return self.reference.braking(count)
+
+    def command(self, state: Any, velocity: Array, dt: float) -> Array:
+        return self.reference.command(state.reference, velocity, dt)
+
+    def halt(self, state: Any, dt: float) -> Array:
+        return self.reference.halt(state.reference, dt)
+
+    def lowest(self, state: Any, command: Array, normals: Array, dt: float) -> Array:
+        return self.reference.lowest(state.reference, command, normals, dt)
+
+    def rows(self, state: Any, normals: Array, least: Array, dt: float) -> Array:
+        return self.reference.rows(state.reference, normals, least, dt)
+
+    def farthest(self, state: Any, command: Array, dt: float) -> Array:
+        return self.reference.farthest(state.reference, command, dt)
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        return self.reference.bounded(slack, dt)
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        return self.reference.approach(distance, dt)
+
+    def reach(self, state: Any, dt: float) -> tuple[Array, Array]:
+        return self.reference.reach(state.reference, dt)
 
 
 def each(value: Number, count: int) -> Array:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from consat.errors import InvalidSettings
 from consat.robots.double import DoubleState
@@ -421,10 +422,4 @@ def _across(ahead: np.ndarray) -> np.ndarray:
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices, (N, 3, 3), of quaternions, (N, 4)."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
