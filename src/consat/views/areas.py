@@ -7,12 +7,11 @@ frame only replaces their paths.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from contourpy import FillType, LineType, contour_generator
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
@@ -20,11 +19,10 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 
 from consat.problem.team import Team
-from consat.views.figures import STYLES, colour
+from consat.views.colours import STYLES, colour_of
+from consat.views.regions import contours, filled
 from consat.views.shapes import BALLS, alike, moves
 
-SHARED: Final = "0.3"
-"""Colour of regions that several agents share."""
 HATCH: Final = "////"
 TINT, SHADE = 0.15, 0.16
 
@@ -52,11 +50,6 @@ class Area:
     moves: bool
     colour: str
     style: Any
-
-
-def colour_of(owners: Sequence[int]) -> str:
-    """Colour of a region: that of its owner; `SHARED` for several owners."""
-    return colour(owners[0]) if len(owners) == 1 else SHARED
 
 
 def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
@@ -174,23 +167,6 @@ def legend_patch(shade: Any, label: str) -> Patch:
     patch = Patch(**keep_out_style(shade), label=label)
     patch.set_hatch_linewidth(0.7)
     return patch
-
-
-def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Polylines (P, 2) on which values (L, K) are zero, the higher values on their left. A closed line ends at its first point."""
-    if np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
-        lines: Any = contour_generator(across, up, np.ma.masked_invalid(values), line_type=LineType.Separate).lines(0.0)
-        yield from lines
-
-
-def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
-    """Path around the points where values (L, K) are positive."""
-    top = float(np.nanmax(values, initial=0.0))
-    if top <= 0:
-        return Path(np.zeros((0, 2)))
-    found: Any = contour_generator(across, up, np.ma.masked_invalid(values), fill_type=FillType.OuterCode).filled(0.0, 2 * top)
-    pieces = [Path(outline, code) for outline, code in zip(*found, strict=True)]
-    return Path.make_compound_path(*pieces) if pieces else Path(np.zeros((0, 2)))
 
 
 def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:

@@ -15,9 +15,8 @@ from matplotlib.path import Path
 
 from consat.problem.team import Team
 from consat.views import areas, space
-from consat.views.areas import SHARED
-from consat.views.colours import AREA, LINK, TRAIL
-from consat.views.figures import regions
+from consat.views.colours import AREA, LINK, SHARED, TRAIL
+from consat.views.regions import contours, regions
 from consat.views.shapes import Shapes
 
 MOST_LINES: Final = 2000
@@ -82,7 +81,7 @@ def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> lis
         values = regions(team, x, view.points, others).reshape(-1, fine, fine).swapaxes(1, 2)
         across, up = view.along
         for number in sorted(int(number) for family in others for number in family.number):
-            for line in areas.contours(across, up, values[number]):
+            for line in contours(across, up, values[number]):
                 axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))
     return [artist for artist in axes.get_children() if artist not in before]
 

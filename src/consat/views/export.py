@@ -19,7 +19,7 @@ def _csv(result: Result, target: Path, progress: Progress | None) -> None:
     """One row per agent and recorded time or round: the time in s if rounds have a duration, position, and margin, empty if infinite."""
     import xarray as xr
 
-    from consat.views.figures import period, seconds
+    from consat.views.record import period, seconds
 
     data = result.data
     clock = str(data["position"].dims[0])

@@ -20,12 +20,10 @@ from consat.errors import InvalidSettings
 from consat.results.result import Result
 from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.views import bodies, space
-from consat.views.areas import SHARED, colour_of
-from consat.views.colours import LINK
-from consat.views.figures import colour, period, view
-from consat.views.outlines import MOST, outlines
+from consat.views.colours import LINK, SHARED, colour, colour_of
 from consat.views.picture import FEW
-from consat.views.record import Record
+from consat.views.record import Record, period
+from consat.views.regions import MOST, outlines, view
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
 if TYPE_CHECKING:
@@ -185,7 +183,7 @@ class _Scene:
                 continue
             out, radius = bool(balls.keeps_out[j]), float(balls.radius[j])
             shade = _colour(SHARED if out else colour_of(balls.owners[j]), 0.7 if out else 0.12)
-            name = f"{'keep-out' if out else 'region'} {int(balls.number[j])}"
+            name = f"{'keep-out' if out else 'region'} {balls.numbers[j][0]}"
             height = None if not self._flat else (4 if out else 1) * THIN
             body = _round(centers[j, None], balls.radius[j, None], [shade], height)
             angle = np.linspace(0, 2 * np.pi, 65)[:, None]
@@ -196,7 +194,7 @@ class _Scene:
         if walls.normal.shape[1] == 1:
             return
         found = dict(space.faces(walls, self._low, self._high))
-        for j, number in enumerate(walls.number.tolist()):
+        for j, (number, *_) in enumerate(walls.numbers):
             if k and not self._moves[number]:
                 continue
             corners = found.get(j, np.zeros((0, walls.normal.shape[1])))  # none where it is out of view

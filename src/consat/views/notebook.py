@@ -126,8 +126,9 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     from matplotlib.patches import Circle
 
     from consat.views import areas, colours
-    from consat.views.figures import colour, label, marker, plain
+    from consat.views.colours import colour, marker
     from consat.views.shapes import shapes
+    from consat.views.words import label, plain
 
     if found.count > MOST_DRAWN or found.dimension != 2:
         return None
@@ -145,10 +146,10 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
         centers = balls.at(places)
         for k in np.flatnonzero(balls.around < 0):
             owners, radius = balls.owners[k], balls.radius[k]
-            shade = areas.colour_of(owners) if found.count <= MOST_ROWS else colours.AREA
-            style = areas.keep_out_style(areas.SHARED) if balls.keeps_out[k] else {"facecolor": shade, "alpha": 0.15}
+            shade = colours.colour_of(owners) if found.count <= MOST_ROWS else colours.AREA
+            style = areas.keep_out_style(colours.SHARED) if balls.keeps_out[k] else {"facecolor": shade, "alpha": 0.15}
             axes.add_patch(Circle(tuple(centers[k]), radius, **style))
-            axes.add_patch(Circle(tuple(centers[k]), radius, fill=False, edgecolor=areas.SHARED if balls.keeps_out[k] else shade))
+            axes.add_patch(Circle(tuple(centers[k]), radius, fill=False, edgecolor=colours.SHARED if balls.keeps_out[k] else shade))
     else:
         angle = 2 * np.pi * np.arange(found.count) / found.count + np.pi / 2
         places = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -23,10 +23,10 @@ from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
 from consat.views.colours import classes
-from consat.views.outlines import MOST, outlines
 from consat.views.page import page as assembled
 from consat.views.picture import FEW, MOST_SHAPES
 from consat.views.record import Record, spread
+from consat.views.regions import MOST, outlines
 from consat.views.shapes import Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
@@ -197,16 +197,14 @@ def _regions(
     if team is None or len(team.owner) > MOST_SHAPES:
         return low, high, {"balls": [], "walls": [], "outlines": []}
     found = shapes(team, times[-1])
-    balls, walls = picture.constraints_of(team, found)
     moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
     seen = [shapes(team, times[moment]) for moment in moments]
-    ties = moves(team)
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
             {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
-            for k, ball in enumerate(picture.balls_of(team, found, balls))
+            for k, ball in enumerate(picture.balls_of(team, found.balls))
         ],
-        "walls": _walls(team, [*seen, found], walls, ties[found.walls.number], moments, (low, high)),
+        "walls": _walls(team, [*seen, found], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
     return low, high, told
@@ -226,24 +224,21 @@ def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[
     }
 
 
-def _walls(
-    team: Team, seen: Sequence[Shapes], members: list[list[int]], ties: np.ndarray, moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]
-) -> list[Mapping[str, Any]]:
+def _walls(team: Team, seen: Sequence[Shapes], moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> list[Mapping[str, Any]]:
     """The half-spaces, those that move with their corners and normals at some samples; without corners where they are out of view.
 
     Args:
         team: the team.
         seen: its geometry at the samples, and, as the last, at the end.
-        members: from `picture.constraints_of`.
-        ties: (K,) whether each half-space moves.
         moments: the samples.
         box: lower and upper corner of the view.
     """
-    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, members, *box)} for each in seen)
+    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, *box)} for each in seen)
     found: list[Mapping[str, Any]] = []
-    for k, moving in enumerate(ties.tolist()):
+    ties = moves(team)
+    for k, numbers in enumerate(seen[-1].walls.numbers):
         known = [each[k] for each in (*before, last) if k in each]
-        if not known or not (moving and before):
+        if not known or not (before and ties[numbers[0]]):
             found += known[-1:]
             continue
         normals = [np.round(each.walls.normal[k], 6).tolist() for each in seen[:-1]]

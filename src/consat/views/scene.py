@@ -20,13 +20,13 @@ from matplotlib.patheffects import withStroke
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.views import areas, bodies, crowd, space
-from consat.views.areas import SHARED, Area, Ground
-from consat.views.colours import AREA, LINK, TRAIL, classes
+from consat.views.areas import Area, Ground
+from consat.views.colours import AREA, GREY, LINK, SHARED, TRAIL, classes, colour, marker
 from consat.views.crowd import MOST_LINES, View
-from consat.views.figures import GREY, colour, grid, label, marker, plain, regions, view
 from consat.views.record import Record, between
+from consat.views.regions import grid, regions, view
 from consat.views.shapes import Shapes, boxes, moves, shapes, ways
-from consat.views.words import typeset
+from consat.views.words import label, plain, typeset
 
 MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES = 12, 40, 16
 MOST_SHAPES = 20_000

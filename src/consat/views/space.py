@@ -12,8 +12,8 @@ from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from consat.problem.team import Team
-from consat.views.areas import SHARED, colour_of
-from consat.views.figures import colour, grid, regions
+from consat.views.colours import SHARED, colour, colour_of
+from consat.views.regions import grid, regions
 from consat.views.shapes import Balls, Shapes, Walls
 
 MOST_BALLS: Final = 60

@@ -12,7 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
-from consat.views.figures import COLOURS, DPI, GREY, MARKERS, STYLES, plain
+from consat.views.colours import COLOURS, GREY, MARKERS, STYLES
+from consat.views.figures import DPI
+from consat.views.words import plain
 
 MOST_LINES, MOST_BANDS = 6, 3
 """Most values of the other parameters that have a line, and most lines whose spread is a band; with more lines it is bars."""
