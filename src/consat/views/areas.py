@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
@@ -20,7 +21,7 @@ from matplotlib.path import Path
 
 from consat.problem.team import Team
 from consat.views.colours import STYLES, colour_of
-from consat.views.regions import contours, filled
+from consat.views.regions import EMPTY, contours, filled
 from consat.views.shapes import BALLS, alike, moves
 
 HATCH: Final = "////"
@@ -127,16 +128,15 @@ class Ground:
             up: (L,) grid coordinates on the vertical axis.
             values: (M, L, K) weighted ψ, NaN where not finite.
         """
-        some = len(across) > 1
         for numbers, patch in self._common:
-            patch.set_path(filled(across, up, values[numbers].min(axis=0)) if some else Path(np.zeros((0, 2))))
+            patch.set_path(filled(across, up, values[numbers].min(axis=0)))
         for area, edge, ticks in zip(self.found, self._edges, self._ticks, strict=True):
             psi = values[area.number]
-            lines = list(contours(across, up, psi)) if some else []
-            edge.set_path(Path.make_compound_path(*map(Path, lines)) if lines else Path(np.zeros((0, 2))))
+            lines = list(contours(across, up, psi))
+            edge.set_path(Path.make_compound_path(*map(Path, lines)))
             ticks.set_path(_strokes(lines if area.leaves else [], self._unit))
             if area.keeps_out:
-                self._keep_outs[area.number].set_path(filled(across, up, -psi) if some else Path(np.zeros((0, 2))))
+                self._keep_outs[area.number].set_path(filled(across, up, -psi))
 
 
 def _weight(area: Area) -> dict[str, float]:
@@ -145,7 +145,7 @@ def _weight(area: Area) -> dict[str, float]:
 
 
 def _patch(axes: Any, gid: str, **style: Any) -> PathPatch:
-    patch = PathPatch(Path(np.zeros((0, 2))), gid=gid, **style)
+    patch = PathPatch(EMPTY, gid=gid, **style)
     axes.add_artist(patch)
     return patch
 
@@ -160,6 +160,14 @@ def hatched(axes: Any, shade: Any) -> PathPatch:
 def keep_out_style(shade: Any) -> dict[str, Any]:
     """Fill style of a keep-out: a tint and a hatch in the same colour."""
     return {"facecolor": to_rgba(shade, SHADE), "edgecolor": to_rgba(shade, 0.75), "hatch": HATCH, "linewidth": 0.0}
+
+
+def discs(axes: Any, centers: np.ndarray, radii: np.ndarray, **style: Any) -> EllipseCollection:
+    """Add discs of radii (K,) at centers (K, 2) to the axes, as one artist."""
+    place: dict[str, Any] = {"units": "xy", "angles": 0.0, "offsets": centers, "offset_transform": axes.transData}
+    found = EllipseCollection(2 * radii, 2 * radii, **place, **style)
+    axes.add_collection(found, autolim=False)
+    return found
 
 
 def legend_patch(shade: Any, label: str) -> Patch:
@@ -180,8 +188,6 @@ def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
         right = (ahead - foot)[:, ::-1] * [1.0, -1.0]
         found.append(np.stack([foot, foot + right / np.maximum(np.hypot(*right.T), 1e-300)[:, None] / 80], axis=1) * unit)
     segments = np.concatenate(found)
-    if not len(segments):
-        return Path(np.zeros((0, 2)))
     return Path(segments.reshape(-1, 2), np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments)))
 
 

@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
@@ -16,8 +15,9 @@ from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from consat.results.result import Result
-from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
+from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.scenario.robots import Robots
+from consat.views.areas import discs
 from consat.views.space import sphere
 
 SOLID: Final = "0.62"
@@ -108,7 +108,6 @@ def _bounds(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray]:
         return np.array(obstacle.center) - obstacle.radius, np.array(obstacle.center) + obstacle.radius
     if isinstance(obstacle, Box):
         return np.array(obstacle.low), np.array(obstacle.high)
-    assert isinstance(obstacle, Polygon)
     return np.min(obstacle.vertices, axis=0), np.max(obstacle.vertices, axis=0)
 
 
@@ -120,7 +119,6 @@ def outline(obstacle: Obstacle) -> Path:
         (left, bottom), (right, top) = obstacle.low, obstacle.high
         corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     else:
-        assert isinstance(obstacle, Polygon)
         corners = list(obstacle.vertices)
     return Path([*corners, corners[0]], closed=True)
 
@@ -161,11 +159,8 @@ class Crew:
 
     def __init__(self, axes: Any, found: Bodies, shades: Sequence[Any] | None) -> None:
         self._found = found
-        size = 2 * found.radius
-        look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0, "zorder": 4.5}
-        offsets = np.zeros((len(size), 2))
-        self._discs = EllipseCollection(size, size, offsets=offsets, edgecolors=EDGE, linewidths=0.8, gid="body", **look)
-        axes.add_collection(self._discs, autolim=False)
+        somewhere = np.zeros((len(found.radius), 2))
+        self._discs = discs(axes, somewhere, found.radius, edgecolors=EDGE, linewidths=0.8, zorder=4.5, gid="body")
         self._strokes = Line2D([], [], color=EDGE, linewidth=1.4, solid_capstyle="butt", zorder=4.6, gid="heading")
         axes.add_artist(self._strokes)
         if shades is not None:

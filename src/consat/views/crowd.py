@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.collections import EllipseCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
@@ -57,22 +56,20 @@ def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> lis
     before = set(axes.get_children())
     center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
     goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
-    look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
+    radius = found.balls.radius
     if len(goals):
-        discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
-        union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
+        circles = [Path.circle(center[k], radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
+        union = PathPatch(Path.make_compound_path(*circles), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
         axes.add_artist(union)
     if 0 < len(goals) <= MOST_TINTED:
-        size = 2 * found.balls.radius[goals]
         ring: dict[str, Any] = {"facecolors": "none", "edgecolors": [(*AREA, 0.55)], "linewidths": 0.7, "gid": "boundary"}
-        axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.7, **ring, **look))
+        areas.discs(axes, center[goals], radius[goals], zorder=0.7, **ring)
     if len(bars) > MOST_HATCHED:
-        size = 2 * found.balls.radius[bars]
         dark: dict[str, Any] = {"facecolors": [(0.3, 0.3, 0.3, 0.35)], "edgecolors": [(0.3, 0.3, 0.3, 0.8)], "linewidths": 0.6}
-        axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.8, gid="keep-out", **dark, **look))
+        areas.discs(axes, center[bars], radius[bars], zorder=0.8, gid="keep-out", **dark)
     for k in bars if len(bars) <= MOST_HATCHED else ():
-        areas.hatched(axes, SHARED).set_path(Path.circle(center[k], found.balls.radius[k]))
-        axes.add_artist(Circle(center[k], found.balls.radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
+        areas.hatched(axes, SHARED).set_path(Path.circle(center[k], radius[k]))
+        axes.add_artist(Circle(center[k], radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
     for normal, offset in list(zip(found.walls.normal, found.walls.offset, strict=True))[:MOST_WALLS]:
         areas.wall(axes, view.low, view.high, normal, offset, SHARED)
     others = [family for family in team.families if family.arity == 1 and np.isin(family.number, found.others).any()]

@@ -43,9 +43,8 @@ def frame(
     dimension, balls = x.shape[2], shapes(team, float(times[-1])).balls
     around = [boxes(team)[:, :, :dimension], ways(team, times)[:, :, :dimension], *([] if stand is None else [stand])]
     if team.dimension <= 3:
-        center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
-        fixed = np.concatenate([center - radius, center + radius], axis=1)
-        around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
+        every = balls.boxes(x[-1])
+        around.append(every if x.shape[1] <= FEW else every[balls.around < 0])
     low, high, _ = view(x, x[-1], None, np.concatenate(around))
     return low, high
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ FAR = 6.0
 """Paths are cut where they would make the view more than this factor wider, so that the formation stays visible."""
 FINE = 81
 """Grid points per axis of traced outlines."""
+EMPTY: Final = Path(np.zeros((0, 2)))
 MOST = 40
 """Most constraints whose boundaries are traced. If there are more, none is."""
 
@@ -82,7 +83,7 @@ def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ite
 
 def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
     """Polylines (P, 2) on which values (L, K) are zero, the higher values on their left. A closed line ends at its first point."""
-    if np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
+    if min(values.shape) > 1 and np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
         lines: Any = contour_generator(across, up, np.ma.masked_invalid(values), line_type=LineType.Separate).lines(0.0)
         yield from lines
 
@@ -90,11 +91,11 @@ def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator
 def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
     """Path around the points where values (L, K) are positive."""
     top = float(np.nanmax(values, initial=0.0))
-    if top <= 0:
-        return Path(np.zeros((0, 2)))
+    if min(values.shape) < 2 or top <= 0:
+        return EMPTY
     found: Any = contour_generator(across, up, np.ma.masked_invalid(values), fill_type=FillType.OuterCode).filled(0.0, 2 * top)
     pieces = [Path(outline, code) for outline, code in zip(*found, strict=True)]
-    return Path.make_compound_path(*pieces) if pieces else Path(np.zeros((0, 2)))
+    return Path.make_compound_path(*pieces)
 
 
 def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -150,9 +150,7 @@ class Scene:
         found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self.record.times[: self.last + 1])[:, :, :axes]]
         if not self._few and self._shapes is not None and not self._line:
             balls = self._shapes.balls
-            fixed = balls.around < 0
-            center, radius = balls.at(x)[fixed, None, :axes], balls.radius[fixed, None, None]
-            found.append(np.concatenate([center - radius, center + radius], axis=1))
+            found.append(balls.boxes(x)[balls.around < 0, :, :axes])
         return np.concatenate(found)
 
     def _near(self, axes: int) -> np.ndarray:

@@ -48,6 +48,11 @@ class Balls:
         """(K, d) absolute centres, with the team at x (N, d)."""
         return self.center + np.where(self.around[:, None] >= 0, x[self.around], 0.0)
 
+    def boxes(self, x: np.ndarray) -> np.ndarray:
+        """(K, 2, d) boxes around the balls, low and high corner, with the team at x (N, d)."""
+        center, radius = self.at(x)[:, None], self.radius[:, None, None]
+        return np.concatenate([center - radius, center + radius], axis=1)
+
 
 @dataclass(frozen=True, eq=False)
 class Walls:
@@ -168,9 +173,7 @@ def ways(team: Team, times: np.ndarray) -> np.ndarray:
     if team.moves:
         for time in times[:: max(1, len(times) // WAYS)].tolist():
             balls = shapes(team, time).balls
-            which = balls.moves & (balls.around < 0)
-            center, radius = balls.center[which, None], balls.radius[which, None, None]
-            found.append(np.concatenate([center - radius, center + radius], axis=1))
+            found.append(balls.boxes(np.zeros((team.count, team.dimension)))[balls.moves & (balls.around < 0)])
     return np.concatenate(found)
 
 
