@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from consat.results.result import Result
 from consat.views.colours import COLOURS, GREY, STYLES, colour
 from consat.views.record import evenly, period, recorded, seconds
+from consat.views.scene import Scene
 from consat.views.words import label, plain, typeset
 
 if TYPE_CHECKING:
@@ -49,9 +50,7 @@ def formation(result: Result, axes: Any = None) -> Figure | None:
     """
     if "position" not in result.data:
         return None
-    from consat.views.scene import Scene  # the figure is the last moment of the film
-
-    scene = Scene(result, axes)
+    scene = Scene(result, axes)  # the figure is the last moment of the film
     scene.show(scene.last)
     figure: Figure = scene.figure
     return figure
