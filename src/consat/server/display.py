@@ -18,7 +18,7 @@ from consat.server import frames
 from consat.server.background import Background
 from consat.server.board import Board
 from consat.server.scene import Scene
-from consat.server.targets import CENTERS, place_of
+from consat.server.targets import CENTERS, family_of
 
 MOST_PATCHED: Final = 50
 """Most balls that are shown one by one. If more have changed, the scene is shown anew."""
@@ -87,7 +87,7 @@ class Display:
             self.restructure(session)
             return
         for k in hit:
-            family, m = place_of(team, balls[k][0])
+            family, m = family_of(team, balls[k][0])
             given = {key: value[m] for key, value in family.parameters.items()}
             center = given.get(CENTERS.get(family.kind, ""), np.zeros(team.dimension))
             self._patches[k] = {"center": np.asarray(center).tolist(), "radius": float(given["radius"])}

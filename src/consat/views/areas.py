@@ -70,19 +70,13 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
         rank = ranks[int(owners[number])].setdefault(name, len(ranks[int(owners[number])]))
         keeps_out, leaves = BALLS.get(kind, False), False
         if values is not None:
-            edge = values[number][_edge(values.shape[1:])]
-            keeps_out = keeps_out or bool((values[number] < 0).any() and (edge > 0).all())
+            psi = values[number]
+            edge = np.concatenate([psi[0], psi[-1], psi[:, 0], psi[:, -1]])
+            keeps_out = keeps_out or bool((psi < 0).any() and (edge > 0).all())
             leaves = bool(not keeps_out and (edge > 0).any() and (edge < 0).any())
         style = "-" if keeps_out else STYLES[rank % len(STYLES)]
         found.append(Area(number, name, mine, keeps_out, leaves, bool(ties[number]), colour_of(mine), style))
     return found
-
-
-def _edge(shape: tuple[int, ...]) -> np.ndarray:
-    """Mask of the points on the border of a grid of this shape."""
-    edge = np.ones(shape, dtype=bool)
-    edge[(slice(1, -1),) * len(shape)] = False
-    return edge
 
 
 class Ground:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 
+from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.views import areas, space
 from consat.views.colours import AREA, LINK, SHARED, TRAIL
@@ -41,6 +42,11 @@ class View(NamedTuple):
     unit: np.ndarray
     along: np.ndarray
     points: np.ndarray
+
+    def psi(self, team: Team, x: np.ndarray, families: Sequence[Family] | None = None) -> np.ndarray:
+        """(M, K, K) every ψ on the grid, rows upwards, with all other agents at x (N, d); see `regions`."""
+        count = self.along.shape[1]
+        return regions(team, x, self.points, families).reshape(-1, count, count).swapaxes(1, 2)
 
 
 def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> list[Artist]:
@@ -74,9 +80,7 @@ def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> lis
         areas.wall(axes, view.low, view.high, normal, offset, SHARED)
     others = [family for family in team.families if family.arity == 1 and np.isin(family.number, found.others).any()]
     if 0 < sum(family.size for family in others) <= MOST_OTHERS:
-        fine = view.along.shape[1]
-        values = regions(team, x, view.points, others).reshape(-1, fine, fine).swapaxes(1, 2)
-        across, up = view.along
+        values, (across, up) = view.psi(team, x, others), view.along
         for number in sorted(int(number) for family in others for number in family.number):
             for line in contours(across, up, values[number]):
                 axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))

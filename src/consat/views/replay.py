@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -136,14 +137,15 @@ def document(result: Result) -> dict[str, Any]:
     spread by movement and time.
     """
     record, summary, team = Record(result), result.summary, None if "final_position" in result.data else result.team
-    data, chosen = record.data, _steps(record.x[: record.last + 1, :, :3])
+    data, seen = record.data, record.x[: record.last + 1, :, :3]
+    most = max(2, MOST_NUMBERS // max(1, math.prod(seen.shape[1:])))
+    chosen = np.arange(len(seen)) if len(seen) <= most else _samples(seen, most)
     x, times, steps = record.x[chosen, :, :3], record.times[chosen], record.steps[chosen]
     dimension = x.shape[2]
     stand = bodies.obstacles(result)
     low, high, found = _regions(team, x, times, bodies.bounds(stand, dimension) if dimension > 1 else None)
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
-    since = summary["satisfied_from"]["time" if record.clock == "time" else "round"]
     return {
         "schema": SCHEMA,
         "name": summary["scenario"],
@@ -154,7 +156,7 @@ def document(result: Result) -> dict[str, Any]:
         "verdict": summary["verdict"],
         "bounds": None if summary.get("verdicts") else summary.get("bounds"),
         "verdicts": [[each["from"], each["to"], each["verdict"]] for each in summary.get("verdicts") or ()],
-        "since": since,
+        "since": summary["satisfied_from"]["time" if record.clock == "time" else "round"],
         "steps": _packed(steps),
         "x": _packed(np.nan_to_num(x)),
         "margin": _packed(record.margin[chosen]),
@@ -176,17 +178,13 @@ def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | N
     found = bodies.bodies(result, data)
     if found is None:
         return None
-    turns = found.heading is not None and bool(found.turns.any())
-    heading = _packed(np.nan_to_num(found.heading[chosen])) if found.heading is not None and turns else None
+    heading = None if found.heading is None or not found.turns.any() else _packed(np.nan_to_num(found.heading[chosen]))
     return {"radius": found.radius.tolist(), "offset": found.offset.tolist(), "heading": heading}
 
 
-def _steps(x: np.ndarray) -> np.ndarray:
-    """Indices of the steps that are replayed."""
-    most = max(2, MOST_NUMBERS // max(1, x.shape[1] * x.shape[2]))
-    if len(x) <= most:
-        return np.arange(len(x))
-    return np.unique(np.round(spread(x, np.arange(len(x)), most, MOVEMENT)).astype(int))
+def _samples(x: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` samples of x, (T, N, d), spread by movement and time."""
+    return np.unique(np.round(spread(x, np.arange(len(x)), count, MOVEMENT)).astype(int))
 
 
 def _regions(
@@ -197,7 +195,7 @@ def _regions(
     if team is None or len(team.owner) > MOST_SHAPES:
         return low, high, {"balls": [], "walls": [], "outlines": []}
     found = shapes(team, times[-1])
-    moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
+    moments = _samples(x, MOST_OUTLINED) if team.moves else np.zeros(0, dtype=int)
     seen = [shapes(team, times[moment]) for moment in moments]
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
@@ -208,11 +206,6 @@ def _regions(
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
     return low, high, told
-
-
-def _moments(x: np.ndarray) -> np.ndarray:
-    """Samples at which moving regions are written."""
-    return np.unique(np.round(spread(x, np.arange(len(x)), MOST_OUTLINED, MOVEMENT)).astype(int))
 
 
 def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
@@ -254,7 +247,7 @@ def _outlines(
     if team.dimension != 2 or not 0 < len(numbers) <= MOST:
         return []
     moving = moves(team)[numbers]
-    moments = _moments(x) if moving.any() else np.array([len(x) - 1])
+    moments = _samples(x, MOST_OUTLINED) if moving.any() else np.array([len(x) - 1])
     traced = [outlines(team.at(times[moment]), numbers.tolist(), x[moment], low, high) for moment in moments]
     digits = max(0, 4 - int(np.floor(np.log10(float((high - low).max()) or 1.0))))
     found: list[Mapping[str, Any]] = []

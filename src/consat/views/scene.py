@@ -143,8 +143,8 @@ class Scene:
         self._where = _directions(points[: len(self._ids)], list(map(len, self._ids))) if self._few else []
         return 1.25 if self._line or self._space else float((high - low)[0] / (high - low)[1])
 
-    def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray | None:
-        """(B, 2, p) boxes that the view must hold besides the regions that `view` finds; None if there are none."""
+    def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray:
+        """(B, 2, p) boxes that the view must hold besides the regions that `view` finds."""
         if self._team is None:
             return self._near(axes)
         found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self.record.times[: self.last + 1])[:, :, :axes]]
@@ -169,12 +169,9 @@ class Scene:
             values = np.stack([regions(team.at(time), at, self._view.points) for time, at in columns], axis=2)
             self._areas, self._tube = areas.areas(team, values), values
         elif self._few and not self._space:
-            shape = (-1, self._fine, self._fine)
-            values = regions(team.at(self.record.times[self.last]), x, self._view.points).reshape(shape).swapaxes(1, 2)
-            self._moves = [family for family in team.families if family.arity > 1 or family.tracks]
-            changing = {int(number) for family in self._moves for number in family.number}
-            self._still = np.array([number for number in range(len(team.owner)) if number not in changing], dtype=int)
-            self._areas, self._values = areas.areas(team, values), values
+            self._values = self._view.psi(team.at(self.record.times[self.last]), x)
+            self._moves = moves(team)
+            self._areas = areas.areas(team, self._values)
         elif self._few:
             self._areas = areas.areas(team)
         elif self._shapes is not None and not self._space and not self._line:
@@ -254,7 +251,9 @@ class Scene:
         axes.add_artist(self._wires)
         self._names: list[Any] = []
         if self._few:
-            every = range(self.x.shape[1])
+            every, robots = range(self.x.shape[1]), self._robots
+            room = 0.0 if robots is None else (robots.radius + robots.offset) / self._view.unit[0]
+            away = np.broadcast_to(np.maximum(7.0, 3 + 330 * room), len(every))
             self._paths = [axes.plot([], [], **_path(i))[0] for i in every]
             starts = [axes.plot(*trail[0, i, :, None], **_start(i))[0] for i in every]
             self._heads = [axes.plot([], [], **self._head(i))[0] for i in every]
@@ -262,12 +261,9 @@ class Scene:
             for i, name in enumerate(self._ids):
                 x, y = self._where[i]
                 place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
-                far = (
-                    7.0
-                    if self._robots is None
-                    else max(7.0, 3 + 330 * (self._robots.radius[i] + self._robots.offset[i]) / self._view.unit[0])
+                self._names.append(
+                    axes.annotate(name, trail[0, i], (away[i] * x, away[i] * y), textcoords="offset points", **_ink(i), **place)
                 )
-                self._names.append(axes.annotate(name, trail[0, i], (far * x, far * y), textcoords="offset points", **_ink(i), **place))
             crew = [] if self._crew is None else self._crew.artists
             self.moving = [*ground, self._wires, *self._paths, *starts, *crew, *self._heads, *self._names]
             return
@@ -326,13 +322,10 @@ class Scene:
             seen = np.count_nonzero(self._columns <= moment)
             ground.show(between(self.steps, self._columns[:seen]), self._view.along[0], self._tube[:, :, :seen])
             return
-        if self._moves:
-            shape = self._values.shape
-            families = [family.at(self.record.time(moment)) for family in self._moves]
-            values = regions(cast(Team, self._team), self.record.where(moment), self._view.points, families)
-            values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
-            values[self._still] = self._values[self._still]
-            self._values = values
+        if self._moves.any():
+            now = cast(Team, self._then(moment))
+            families = [family for family in now.families if self._moves[family.number].any()]
+            self._values[self._moves] = self._view.psi(now, self.record.where(moment), families)[self._moves]
         across, up = self._view.along
         ground.show(across, up, self._values)
 
