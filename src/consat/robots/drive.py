@@ -129,10 +129,12 @@ class Drive:
         if self.dimension not in self.model.dimensions:
             allowed = " or ".join(map(str, self.model.dimensions))
             faults.append(Fault(("robots", "kind"), f"{kind} robots move in {allowed} dimensions, but the team has {self.dimension}"))
-        for name, low in (("dt", 0.0), ("share", 0.0), ("noise", -1.0)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > low) or (name == "share" and value > 1.0) or (name == "noise" and value < 0.0):
-                allowed = {"dt": "positive", "share": "above 0 and at most 1", "noise": "0 or more"}[name]
+        for name, value, fits, allowed in (
+            ("dt", self.dt, self.dt > 0.0, "positive"),
+            ("share", self.share, 0.0 < self.share <= 1.0, "above 0 and at most 1"),
+            ("noise", self.noise, self.noise >= 0.0, "0 or more"),
+        ):
+            if not (math.isfinite(value) and fits):
                 faults.append(Fault(("robots", name), f"must be {allowed}, but is {value:g}"))
         if faults:
             raise InvalidInput(faults)

@@ -12,7 +12,7 @@ from consat.problem.team import Team
 from consat.scenario.robots import Robots, obstacle_data
 from consat.views import bodies, picture
 from consat.views.regions import MOST, outlines
-from consat.views.shapes import Shapes, moves, shapes
+from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 MOST_LISTED: Final = 2000
 """Most constraints that are listed on the page."""
@@ -41,7 +41,7 @@ class Scene(NamedTuple):
         paths = x[None, :, :3]
         stand = None if robots is None or paths.shape[2] < 2 else bodies.bounds(robots.obstacles, paths.shape[2])
         low, high = picture.frame(team, paths, stand=stand)
-        drawn = team if len(team.owner) <= picture.MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
+        drawn = team if len(team.owner) <= MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
         return cls(number, team, shapes(drawn), low, high)
 
     @property

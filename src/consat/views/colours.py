@@ -14,6 +14,8 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = ("o", "s", "^", "D", "v", "<", ">")
 STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
 GREY = "0.45"
+FEW: Final = 12
+"""Most agents that have colours of their own. The pages' script has the same number."""
 LINK: Final = "#4d5663"
 """Colour of links: dark. They differ from paths in lightness, so that every reader can tell them apart."""
 TRAIL: Final = "#dccaa4"

@@ -22,8 +22,7 @@ from consat.numerics import number
 from consat.results.result import Result
 from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.views import bodies, space
-from consat.views.colours import LINK, SHARED, colour, colour_of
-from consat.views.picture import FEW
+from consat.views.colours import FEW, LINK, SHARED, colour, colour_of
 from consat.views.record import Record, period
 from consat.views.regions import MOST, outlines, view
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 WORLD: Final = "world"
 ROUND: Final = 0.1
 """Duration of a round in the file, s, for runs whose clock is rounds."""
-MOST_NAMED, MOST_SHAPES, MOST_NUMBERS = 200, 2_000, 10_000_000
+MOST_NAMED, MOST_SHAPES = 200, 2_000
 THIN: Final = 0.02
 """Height of discs in the plane, relative to their radius."""
 

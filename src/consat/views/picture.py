@@ -7,19 +7,15 @@ indices of agents in the team; ``names`` are the names of their constraints, in 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from consat.problem.team import Team
 from consat.views import space
+from consat.views.colours import FEW
 from consat.views.regions import view
-from consat.views.shapes import Balls, Walls, boxes, shapes, ways
-
-MOST_SHAPES: Final = 20_000
-"""Most constraints of a team whose regions are drawn. Of a team with more, none is."""
-FEW: Final = 12
-"""Most agents that have colours of their own. The pages' script has the same number."""
+from consat.views.shapes import MOST_SHAPES, Balls, Walls, boxes, shapes, ways
 
 
 def frame(

@@ -23,12 +23,11 @@ from consat.problem.team import Team
 from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
 from consat.views import bodies, picture, words
-from consat.views.colours import classes
+from consat.views.colours import FEW, classes
 from consat.views.page import page as assembled
-from consat.views.picture import FEW, MOST_SHAPES
 from consat.views.record import Record, spread
 from consat.views.regions import MOST, outlines
-from consat.views.shapes import Shapes, moves, shapes
+from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000

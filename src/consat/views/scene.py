@@ -1,6 +1,6 @@
 """Drawing of the formation at any recorded moment: paths, constraint regions, links and labels on one set of axes.
 
-A small team has at most `MOST_AGENTS` agents and `MOST_CONSTRAINTS` constraints: each agent has its colour, marker and name. A larger team
+A small team has at most `FEW` agents and `MOST_CONSTRAINTS` constraints: each agent has its colour, marker and name. A larger team
 is drawn as a crowd: agents are dots coloured by margin.
 """
 
@@ -21,16 +21,14 @@ from consat.problem.team import Team
 from consat.results.result import Result
 from consat.views import areas, bodies, crowd, space
 from consat.views.areas import Area, Ground
-from consat.views.colours import AREA, GREY, LINK, SHARED, TRAIL, classes, colour, marker
+from consat.views.colours import AREA, FEW, GREY, LINK, SHARED, TRAIL, classes, colour, marker
 from consat.views.crowd import MOST_LINES, View
 from consat.views.record import Record, between
 from consat.views.regions import grid, regions, view
-from consat.views.shapes import Shapes, boxes, moves, shapes, ways
+from consat.views.shapes import MOST_SHAPES, Shapes, boxes, moves, shapes, ways
 from consat.views.words import label, plain, typeset
 
-MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES = 12, 40, 16
-MOST_SHAPES = 20_000
-"""Most constraints of a team whose regions are drawn."""
+MOST_CONSTRAINTS, MOST_ENTRIES = 40, 16
 GRID = 241
 """Grid points per axis of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
@@ -82,7 +80,7 @@ class Scene:
         self.record = record = Record(result)
         data, team = record.data, None if "final_position" in result.data else result.team  # regions need the positions of all agents
         self.x, self.steps, self.last = record.x, record.steps, record.last
-        self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
+        self._few = self.x.shape[1] <= FEW and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
         self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
         self._fine, self._team = fine, team if team is not None and 0 < len(team.owner) <= MOST_SHAPES else None

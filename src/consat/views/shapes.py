@@ -18,6 +18,8 @@ from consat.problem.team import Team
 BALLS: Final[Mapping[str, bool]] = {"within": False, "outside": True, "near": False, "apart": True, "displacement": False}
 """Kinds whose boundary is a ball. The value says whether the owner must stay outside."""
 WALLS: Final = ("halfspace", "box")
+MOST_SHAPES: Final = 20_000
+"""Most constraints of a team whose regions are drawn. Of a team with more, none is."""
 WAYS: Final = 20
 """Number of times at which moving balls are sampled for a view that holds their motion, about."""
 
