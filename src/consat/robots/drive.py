@@ -320,15 +320,7 @@ def _sizes(drive: Drive) -> tuple[np.ndarray, float, float]:
         if drive.sensing is not None:
             return size, drive.sensing, added
         look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
-        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count, dt))), added
-
-
-def longest_halt(model: Model[Any], count: int, dt: float) -> np.ndarray:
-    """(N,) distance of a halt from full speed, m."""
-    if not model.inertial:
-        return np.zeros(count)
-    pace, braking = np.asarray(model.pace(count)), np.asarray(model.braking(count))
-    return pace**2 / (2.0 * braking) + np.where(np.isfinite(braking), braking, 0.0) * dt**2 / 8.0
+        return size, float(2.0 * size.max() + look + 2.0 * np.max(np.asarray(model.halting(count, dt)))), added
 
 
 def _row(rows: Array, index: Array) -> Array:

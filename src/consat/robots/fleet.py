@@ -79,8 +79,8 @@ class Fleet:
     def pace(self, count: int) -> Array:
         return self._joined([model.pace(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
 
-    def braking(self, count: int) -> Array:
-        return self._joined([model.braking(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
+    def halting(self, count: int, dt: float) -> Array:
+        return self._joined([model.halting(len(rows), dt) for model, rows in zip(self.models, self.members, strict=True)])
 
     def command(self, state: tuple[Any, ...], velocity: Array, dt: float) -> Array:
         return self._mapped(lambda model, part, rows: model.command(part, velocity[rows], dt), state)

@@ -7,9 +7,7 @@ process of one robot has N = 1. Positions have shape (N, d), in metres; times ar
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-import operator
 from typing import Any, Generic, Protocol, TypeVar
 
 import jax.numpy as jnp
@@ -17,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from consat.errors import Fault, InvalidInput, shown
+from consat.numerics import add_up
 
 Number = float | np.ndarray
 """A parameter: one number for all robots, or one for each, (N,)."""
@@ -71,8 +70,8 @@ class Model(Protocol, Generic[S]):
     def pace(self, count: int) -> Array:
         """(N,) speed limit, m/s."""
 
-    def braking(self, count: int) -> Array:
-        """(N,) deceleration of a halt, m/s²; infinite if a robot halts at once."""
+    def halting(self, count: int, dt: float) -> Array:
+        """(N,) distance of a halt from full speed, m."""
 
     def command(self, state: S, velocity: Array, dt: float) -> Array:
         """(N, m) command within the limits whose mean velocity over `dt` is `velocity`; if out of reach, with the same direction."""
@@ -114,8 +113,8 @@ class Instant(Model[S]):
     def pace(self, count: int) -> Array:
         return each(self.speed, count)
 
-    def braking(self, count: int) -> Array:
-        return jnp.full(count, jnp.inf)
+    def halting(self, count: int, dt: float) -> Array:
+        return jnp.zeros(count)
 
     def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
         return along(normals, self.place(self.step(state, command, dt)))
@@ -162,8 +161,8 @@ class Following(Model[Any]):
     def pace(self, count: int) -> Array:
         return self.reference.pace(count)
 
-    def braking(self, count: int) -> Array:
-        return self.reference.braking(count)
+    def halting(self, count: int, dt: float) -> Array:
+        return self.reference.halting(count, dt)
 
     def command(self, state: Any, velocity: Array, dt: float) -> Array:
         return self.reference.command(state.reference, velocity, dt)
@@ -203,7 +202,7 @@ def shortened(vectors: Array, limit: Array) -> Array:
 
 def along(normals: Array, points: Array) -> Array:
     """(N, k) n·x for k vectors (N, k, d) and one point (N, d) of each robot."""
-    return functools.reduce(operator.add, [normals[:, :, axis] * points[:, axis][:, None] for axis in range(points.shape[1])])
+    return dot(normals, points[:, None])
 
 
 def squared(vectors: Array) -> Array:
@@ -213,7 +212,7 @@ def squared(vectors: Array) -> Array:
 
 def dot(first: Array, second: Array) -> Array:
     """(…, d) → (…)."""
-    return functools.reduce(operator.add, [first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
+    return add_up([first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
 
 
 def checked(model: Any) -> None:

@@ -190,8 +190,6 @@ def _reference(model: Model[Any]) -> Model[Any]:
 
 def _turned(vectors: Array, angle: Array) -> Array:
     """Vectors (N, d), turned in the plane by angles (N,)."""
-    if vectors.shape[1] == 1:
-        return vectors
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     x, y = vectors[:, 0], vectors[:, 1]
     return jnp.concatenate([jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1), vectors[:, 2:]], axis=1)

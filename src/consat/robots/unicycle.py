@@ -50,8 +50,8 @@ class Unicycle(Instant[UnicycleState]):
     def __post_init__(self) -> None:
         checked(self)
 
-    def start(self, position: Array, angle: Array | None = None) -> UnicycleState:
-        heading = jnp.zeros(len(position)) if angle is None else angle
+    def start(self, position: Array) -> UnicycleState:
+        heading = jnp.zeros(len(position))
         return UnicycleState(position - each(self.offset, len(position))[:, None] * _ahead(heading), heading)
 
     def place(self, state: UnicycleState) -> Array:

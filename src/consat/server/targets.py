@@ -74,9 +74,7 @@ def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> di
     found: dict[str, Any] = {}
     for number in numbers:
         family, k = family_of(team, number)
-        for key in keys:
-            if key == "weight":
-                found[key] = float(family.weight[k])
-            elif key in family.parameters:
-                found[key] = parameter(team, number, key)
+        found |= {key: parameter(team, number, key) for key in keys if key in family.parameters}
+        if "weight" in keys:
+            found["weight"] = float(family.weight[k])
     return found
