@@ -10,7 +10,7 @@ import numpy as np
 
 from consat.problem.team import Team
 from consat.scenario.robots import Robots, obstacle_data
-from consat.views import bodies, picture
+from consat.views import bodies, page_data
 from consat.views.regions import MOST, outlines
 from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
@@ -40,7 +40,7 @@ class Scene(NamedTuple):
         """The scene of a team at positions x, (N, d)."""
         paths = x[None, :, :3]
         stand = None if robots is None or paths.shape[2] < 2 else bodies.bounds(robots.obstacles, paths.shape[2])
-        low, high = picture.frame(team, paths, stand=stand)
+        low, high = page_data.frame(team, paths, stand=stand)
         drawn = team if len(team.owner) <= MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
         return cls(number, team, shapes(drawn), low, high)
 
@@ -78,11 +78,11 @@ class Scene(NamedTuple):
 
     def told_balls(self) -> list[dict[str, Any]]:
         """The balls as plain data."""
-        return picture.balls_of(self.team, self.shapes.balls)
+        return page_data.balls_of(self.team, self.shapes.balls)
 
     def told_walls(self) -> list[Mapping[str, Any]]:
         """The half-spaces as plain data."""
-        return picture.walls_of(self.team, self.shapes.walls, self.low, self.high)
+        return page_data.walls_of(self.team, self.shapes.walls, self.low, self.high)
 
     def traced(self, team: Team, x: np.ndarray) -> str | None:
         """The boundaries of other ψ as JSON; None if there are none to trace."""

@@ -189,7 +189,7 @@ def solution(answer: Mapping[str, Any], found: Team | None) -> str:
 
 def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """HTML of a sweep: one row for each combination of values, and the figure."""
-    from consat.views import spread
+    from consat.views import sweeps
 
     groups = summary["groups"]
     flows = groups[0]["messages"] is None
@@ -205,5 +205,5 @@ def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     note = "<p>median over the seeds (from the 10th to the 90th percentile)</p>"
     title = f"{counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"
     good = all(group["success"] == 1 for group in groups)
-    picture = _image(spread.draw(summary, runs), f"sweep of {summary['scenario']}")
+    picture = _image(sweeps.draw(summary, runs), f"sweep of {summary['scenario']}")
     return _headline(summary["scenario"], title, good) + _table(head, rows, len(groups) - len(rows)) + note + picture

@@ -22,7 +22,7 @@ from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
-from consat.views import bodies, picture, words
+from consat.views import bodies, page_data, words
 from consat.views.colours import FEW, classes
 from consat.views.page import page as assembled
 from consat.views.record import Record, spread
@@ -190,7 +190,7 @@ def _regions(
     team: Team | None, x: np.ndarray, times: np.ndarray, stand: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
     """The box to show, lower and upper corner, and the regions. stand: (B, 2, d) boxes around obstacles."""
-    low, high = picture.frame(team, x, times, stand)
+    low, high = page_data.frame(team, x, times, stand)
     if team is None or len(team.owner) > MOST_SHAPES:
         return low, high, {"balls": [], "walls": [], "outlines": []}
     found = shapes(team, times[-1])
@@ -199,7 +199,7 @@ def _regions(
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
             {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
-            for k, ball in enumerate(picture.balls_of(team, found.balls))
+            for k, ball in enumerate(page_data.balls_of(team, found.balls))
         ],
         "walls": _walls(team, [*seen, found], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
@@ -225,7 +225,7 @@ def _walls(team: Team, seen: Sequence[Shapes], moments: np.ndarray, box: tuple[n
         moments: the samples.
         box: lower and upper corner of the view.
     """
-    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, *box)} for each in seen)
+    *before, last = ({wall["place"]: wall for wall in page_data.walls_of(team, each.walls, *box)} for each in seen)
     found: list[Mapping[str, Any]] = []
     ties = moves(team)
     for k, numbers in enumerate(seen[-1].walls.numbers):
