@@ -11,7 +11,7 @@ import numpy as np
 from consat.problem.team import Team
 from consat.scenario.robots import Robots, obstacle_data
 from consat.views import bodies, page_data
-from consat.views.regions import MOST, outlines
+from consat.views.regions import MOST_TRACED, outlines
 from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 MOST_LISTED: Final = 2000
@@ -87,7 +87,7 @@ class Scene(NamedTuple):
     def traced(self, team: Team, x: np.ndarray) -> str | None:
         """The boundaries of other ψ as JSON; None if there are none to trace."""
         numbers = self.shapes.others
-        if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+        if team.dimension != 2 or not 0 < len(numbers) <= MOST_TRACED:
             return None
         ties = moves(team)[numbers]
         lines = outlines(team, numbers.tolist(), x, self.low, self.high)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,6 +19,9 @@ from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.scenario.robots import Robots
 from consat.views.areas import discs
 from consat.views.space import sphere
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SOLID: Final = "0.62"
 """Colour of obstacles. Only obstacles are solid grey; keep-outs are hatched."""
@@ -65,23 +68,16 @@ class Bodies:
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def machines(result: Result) -> Robots | None:
-    """The robots and the obstacles in the summary of a run; None if the run had no robot layer."""
-    told = result.summary.get("robots")
+def robots(result: Result, data: xr.Dataset) -> tuple[Bodies | None, tuple[Obstacle, ...]]:
+    """The bodies of the agents in `data`, the recorded steps of a result, and the obstacles; None and () if the run had no robot layer."""
+    summary = result.summary
+    told = summary.get("robots")
     if told is None:
-        return None
+        return None, ()
     common = {key: value for key, value in told.items() if key != "own"}
-    return Robots.of({"robots": common, "obstacles": result.summary.get("obstacles") or [], "own": told.get("own", {})})
-
-
-def bodies(result: Result, data: Any) -> Bodies | None:
-    """The bodies of the agents in `data`, an `xarray.Dataset` of the result; None if the run had no robot layer."""
-    known = machines(result)
-    if known is None:
-        return None
+    known = Robots.of({"robots": common, "obstacles": summary.get("obstacles") or [], "own": told.get("own", {})})
     radius, offset = sizes(known, [str(agent) for agent in data["agent"].values])
-    heading = data["heading"].values if "heading" in data else None
-    return Bodies(radius, offset, heading, offset > 0)
+    return Bodies(radius, offset, data["heading"].values if "heading" in data else None, offset > 0), known.obstacles
 
 
 def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -89,12 +85,6 @@ def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     models = [known.own.get(name, known.common) for name in ids]
     radius, offset = ([float(np.max(getattr(model, name, 0.0))) for model in models] for name in ("radius", "offset"))
     return np.array(radius, dtype=float), np.array(offset, dtype=float)
-
-
-def obstacles(result: Result) -> tuple[Obstacle, ...]:
-    """The obstacles of a run; empty if it had no robot layer."""
-    known = machines(result)
-    return () if known is None else known.obstacles
 
 
 def bounds(found: Sequence[Obstacle], axes: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.views import bodies, space
 from consat.views.colours import FEW, LINK, SHARED, colour, colour_of
 from consat.views.record import Record, period
-from consat.views.regions import MOST, outlines, view
+from consat.views.regions import MOST_TRACED, outlines, view
 from consat.views.shapes import Balls, Shapes, Walls, boxes, moves, shapes
 
 if TYPE_CHECKING:
@@ -49,10 +49,9 @@ def save(result: Result, path: Path) -> None:
     data = record.data
     clock = str(data["position"].dims[0])
     x = _in_space(np.nan_to_num(record.x))
-    team = None if "final_position" in result.data else result.team
     steps = data[clock].values.astype(float)
     times = record.times if record.clock == "time" else steps * ROUND
-    ids = [str(name) for name in data["agent"].values]
+    ids = record.ids
     margins, margin, smooth = (data[name].values for name in ("agent_margin", "margin", "smooth_margin"))
     context = foxglove.Context()
     pace = "" if clock == "time" else str(period(result) or ROUND)
@@ -66,7 +65,7 @@ def save(result: Result, path: Path) -> None:
         pictures = channels.SceneUpdateChannel("/scene", context=context)
         numbers = foxglove.Channel("/margin", schema=_schema(["margin", "smooth_margin", "step"]), message_encoding="json", context=context)
         each = foxglove.Channel("/agent_margins", schema=_schema(ids), message_encoding="json", context=context)
-        scene = _Scene(team, ids, x, record.times, int(result.data["position"].shape[2]))
+        scene = _Scene(record.team, ids, x, record.times, int(result.data["position"].shape[2]))
         robots = _Robots(result, data)
         for k, time in enumerate(times):
             stamp = messages.Timestamp(sec=int(time), nsec=round((time - int(time)) * 1e9) % 1_000_000_000)
@@ -134,7 +133,7 @@ class _Scene:
         if team is not None and len(team.owner) <= 10 * MOST_SHAPES and dimension <= 3:
             self._shapes = shapes(team)
             others = self._shapes.others.tolist()
-            self._traced = others if dimension == 2 and len(others) <= MOST else []
+            self._traced = others if dimension == 2 and len(others) <= MOST_TRACED else []
             axes = slice(0, dimension)
             around = np.concatenate([boxes(team)[:, :, axes], np.stack([x[-1].min(axis=0), x[-1].max(axis=0)])[None, :, axes]])
             self._low, self._high, _ = view(x[:, :, axes], x[-1, :, axes], None, around)
@@ -198,7 +197,7 @@ class _Robots:
     """
 
     def __init__(self, result: Result, data: Any) -> None:
-        self._found, self._map = bodies.bodies(result, data), bodies.obstacles(result)
+        self._found, self._map = bodies.robots(result, data)
         self._flat = data.sizes["axis"] < 3
 
     def headings(self, k: int, count: int) -> np.ndarray:

@@ -28,6 +28,8 @@ class Record:
 
     Attributes:
         data: the recorded steps, as in the result.
+        team: the team; None if it is unknown, or if not all agents are recorded, whose positions regions need.
+        ids: ids of the recorded agents.
         x: (T, N, d) positions.
         times: (T,) times, s; round numbers if rounds have no duration.
         steps: (T,) what is shown: times, s, or round numbers if rounds have no duration.
@@ -39,6 +41,8 @@ class Record:
 
     def __init__(self, result: Result) -> None:
         self.data = recorded(result)
+        self.team = None if "final_position" in self.data else result.team
+        self.ids = [str(name) for name in self.data["agent"].values]
         self.x, self.clock = self.data["position"].values, str(self.data["position"].dims[0])
         self.steps, self.margin, self.agent_margin = (self.data[name].values for name in (self.clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))

@@ -26,7 +26,7 @@ FAR = 6.0
 FINE = 81
 """Grid points per axis of traced outlines."""
 EMPTY: Final = Path(np.zeros((0, 2)))
-MOST = 40
+MOST_TRACED = 40
 """Most constraints whose boundaries are traced. If there are more, none is."""
 
 

@@ -26,7 +26,7 @@ from consat.views import bodies, page_data, words
 from consat.views.colours import FEW, classes
 from consat.views.page import page as assembled
 from consat.views.record import Record, spread
-from consat.views.regions import MOST, outlines
+from consat.views.regions import MOST_TRACED, outlines
 from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
@@ -135,13 +135,13 @@ def document(result: Result) -> dict[str, Any]:
     ``walls`` and ``outlines`` are the regions; ``obstacles`` as in a scenario; ``bodies`` of robots. ``spread`` are moments, sample indices
     spread by movement and time.
     """
-    record, summary, team = Record(result), result.summary, None if "final_position" in result.data else result.team
-    data, seen = record.data, record.x[: record.last + 1, :, :3]
+    record, summary = Record(result), result.summary
+    data, team, seen = record.data, record.team, record.x[: record.last + 1, :, :3]
     most = max(2, MOST_NUMBERS // max(1, math.prod(seen.shape[1:])))
     chosen = np.arange(len(seen)) if len(seen) <= most else _samples(seen, most)
     x, times, steps = record.x[chosen, :, :3], record.times[chosen], record.steps[chosen]
     dimension = x.shape[2]
-    stand = bodies.obstacles(result)
+    robots, stand = bodies.robots(result, data)
     low, high, found = _regions(team, x, times, bodies.bounds(stand, dimension) if dimension > 1 else None)
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
@@ -151,7 +151,7 @@ def document(result: Result) -> dict[str, Any]:
         "unit": None if team is None else team.unit,
         "clock": record.clock,
         "dimension": dimension,
-        "ids": [str(name) for name in data["agent"].values],
+        "ids": record.ids,
         "verdict": summary["verdict"],
         "bounds": None if summary.get("verdicts") else summary.get("bounds"),
         "verdicts": [[each["from"], each["to"], each["verdict"]] for each in summary.get("verdicts") or ()],
@@ -166,17 +166,14 @@ def document(result: Result) -> dict[str, Any]:
         "high": [round(float(value), 6) for value in high],
         "spread": [round(float(value), 3) for value in spread(x, steps, SPREAD, MOVEMENT)],
         "scale": {"edges": edges, "shades": shades},
-        "bodies": _bodies(result, data, chosen),
+        "bodies": None if robots is None else _bodies(robots, chosen),
         "obstacles": [obstacle_data(each) for each in stand],
         **found,
     }
 
 
-def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | None:
-    """Sizes of bodies, and headings, (T, N), if there are any; None without robots."""
-    found = bodies.bodies(result, data)
-    if found is None:
-        return None
+def _bodies(found: bodies.Bodies, chosen: np.ndarray) -> dict[str, Any]:
+    """Sizes of bodies, and headings, (T, N), if there are any."""
     heading = None if found.heading is None or not found.turns.any() else _packed(np.nan_to_num(found.heading[chosen]))
     return {"radius": found.radius.tolist(), "offset": found.offset.tolist(), "heading": heading}
 
@@ -243,7 +240,7 @@ def _outlines(
     team: Team, numbers: np.ndarray, x: np.ndarray, times: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[Mapping[str, Any]]:
     """Boundaries of other ψ in the plane; of those that move, at some samples."""
-    if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+    if team.dimension != 2 or not 0 < len(numbers) <= MOST_TRACED:
         return []
     moving = moves(team)[numbers]
     moments = _samples(x, MOST_OUTLINED) if moving.any() else np.array([len(x) - 1])

@@ -78,10 +78,10 @@ class Scene:
 
     def __init__(self, result: Result, axes: Any = None, fine: int = GRID) -> None:
         self.record = record = Record(result)
-        data, team = record.data, None if "final_position" in result.data else result.team  # regions need the positions of all agents
+        data, team = record.data, record.team
         self.x, self.steps, self.last = record.x, record.steps, record.last
         self._few = self.x.shape[1] <= FEW and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
-        self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
+        self._name, self._ids = plain(result.summary["scenario"]), [plain(name, 14) for name in record.ids]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
         self._fine, self._team = fine, team if team is not None and 0 < len(team.owner) <= MOST_SHAPES else None
         self._links = team.links if team is not None and len(team.links) <= MOST_LINES else np.zeros((0, 2), dtype=int)
@@ -96,7 +96,7 @@ class Scene:
         self._lawn: list[Artist] = []
         seen = self.x.shape[2] in (2, 3)
         self._crew: bodies.Crew | None = None
-        self._robots, self._map = (bodies.bodies(result, data), bodies.obstacles(result)) if seen else (None, ())
+        self._robots, self._map = bodies.robots(result, data) if seen else (None, ())
         if self._team is not None and (self._space or not self._few):
             self._shapes = shapes(self._team, self.record.times[self.last])
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
