@@ -275,22 +275,23 @@ class Drive:
     def _looked_at(self, state: Any, memory: Memory, around: Near) -> Memory:
         """The report with the present bodies, given the nearest neighbours."""
         body, place = self.model.body(state), self.model.place(state)
-        radius, report = each(self.model.radius, self.count), memory.report
-        kept = self.model.size(self.count, self.dt)
-        stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - kept)
-        overlap = report.overlap
+        radius, kept, report = each(self.model.radius, self.count), self.model.size(self.count, self.dt), memory.report
+        there, index = around.who < self.count, jnp.minimum(around.who, self.count - 1)
+        within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
+        gap = jnp.where(there, jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index], jnp.inf)
+        report = report._replace(
+            smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf)),
+            strayed=jnp.maximum(report.strayed, jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - kept)),
+            overlap=jnp.maximum(report.overlap, jnp.max(jnp.where(there, within, 0.0), initial=0.0)),
+        )
         if self.map.count:
             clear = self.map.signed_distance(body) - radius
-            overlap = jnp.maximum(overlap, jnp.max(kept - self.map.signed_distance(place)))
             struck = 0 if isinstance(self.model, Simulated) else jnp.sum(clear < 0.0)
-            report = report._replace(clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + struck)
-        index = jnp.minimum(around.who, self.count - 1)
-        within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
-        overlap = jnp.maximum(overlap, jnp.max(jnp.where(around.who < self.count, within, 0.0), initial=0.0))
-        report = report._replace(strayed=jnp.maximum(report.strayed, stray), overlap=overlap)
-        gap = jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index]
-        gap = jnp.where(around.who < self.count, gap, jnp.inf)
-        report = report._replace(smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf)))
+            report = report._replace(
+                clearance=jnp.minimum(report.clearance, jnp.min(clear)),
+                collisions=report.collisions + struck,
+                overlap=jnp.maximum(report.overlap, jnp.max(kept - self.map.signed_distance(place))),
+            )
         if isinstance(self.model, Simulated):  # contacts are the simulator's
             bodies = state.bodies
             touched = memory.touched | bodies.touching if len(memory.touched) else memory.touched

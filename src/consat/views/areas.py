@@ -185,7 +185,7 @@ def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
     return Path(segments.reshape(-1, 2), np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments)))
 
 
-def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> list[Artist]:
+def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> None:
     """Draw the boundary of a half-space normal·x ≤ offset in the plane, with ticks on its forbidden side.
 
     Args:
@@ -195,17 +195,11 @@ def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offse
         normal: (2,) unit vector towards the forbidden side.
         offset: distance of the boundary from the origin, along `normal`.
         shade: colour.
-
-    Returns:
-        the artists: the line and its ticks.
     """
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     foot = middle - (middle @ normal - offset) * normal
     along = np.array([-normal[1], normal[0]]) * size
     line = np.stack([foot - along, foot + along])  # the forbidden side is to its right
     unit = np.full(2, float((high - low).max()))
-    edge = Line2D(*line.T, color=shade, linewidth=1.2, zorder=2, gid="boundary")
-    ticks = PathPatch(_strokes([line], unit), fill=False, edgecolor=shade, linewidth=0.8, zorder=2, gid="ticks")
-    for artist in (edge, ticks):
-        axes.add_artist(artist)
-    return [edge, ticks]
+    axes.add_artist(Line2D(*line.T, color=shade, linewidth=1.2, zorder=2, gid="boundary"))
+    _patch(axes, "ticks", fill=False, edgecolor=shade, linewidth=0.8, zorder=2).set_path(_strokes([line], unit))

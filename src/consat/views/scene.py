@@ -248,34 +248,32 @@ class Scene:
         self._wires = Line2D([], [], color=LINK, alpha=0.8, zorder=1.5, gid="link", **look)
         axes.add_artist(self._wires)
         self._names: list[Any] = []
+        every, robots = range(self.x.shape[1]), self._robots
+        if robots is not None:
+            self._crew = bodies.Crew(axes, robots, [colour(i) for i in every] if self._few else None)
+        crew = [] if self._crew is None else self._crew.artists
         if self._few:
-            every, robots = range(self.x.shape[1]), self._robots
             room = 0.0 if robots is None else (robots.radius + robots.offset) / self._view.unit[0]
             away = np.broadcast_to(np.maximum(7.0, 3 + 330 * room), len(every))
             self._paths = [axes.plot([], [], **_path(i))[0] for i in every]
             starts = [axes.plot(*trail[0, i, :, None], **_start(i))[0] for i in every]
             self._heads = [axes.plot([], [], **self._head(i))[0] for i in every]
-            self._crew = None if self._robots is None else bodies.Crew(axes, self._robots, [colour(i) for i in every])
             for i, name in enumerate(self._ids):
                 x, y = self._where[i]
                 place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
                 self._names.append(
                     axes.annotate(name, trail[0, i], (away[i] * x, away[i] * y), textcoords="offset points", **_ink(i), **place)
                 )
-            crew = [] if self._crew is None else self._crew.artists
             self.moving = [*ground, self._wires, *self._paths, *starts, *crew, *self._heads, *self._names]
             return
-        count = trail.shape[1]
         self._paths = [axes.plot([], [], color=TRAIL, linewidth=1.0, zorder=1, gid="path")[0]]
-        if count <= MOST_LINES:
-            size = 3.5 if count < 200 else 1.5
+        if len(every) <= MOST_LINES:
+            size = 3.5 if len(every) < 200 else 1.5
             axes.plot(*trail[0].T, "o", color=TRAIL, markerfacecolor="white", markersize=size, zorder=1.2, gid="start")
-        if self._robots is not None:
-            self._crew = bodies.Crew(axes, self._robots, None)
-            self.moving = [self._paths[0], self._wires, *self._crew.artists]
-            return
-        self._dots = axes.scatter(*trail[-1].T, **crowd.dots(count))
-        self.moving = [self._paths[0], self._wires, self._dots]
+        self.moving = [self._paths[0], self._wires, *crew]
+        if not crew:
+            self._dots = axes.scatter(*trail[-1].T, **crowd.dots(len(every)))
+            self.moving.append(self._dots)
 
     def show(self, moment: float) -> None:
         """Draw the formation at a moment."""
