@@ -126,9 +126,7 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     from matplotlib.patches import Circle
 
     from consat.views import areas, colours
-    from consat.views.colours import colour, marker
     from consat.views.shapes import shapes
-    from consat.views.words import label, plain
 
     if found.count > MOST_DRAWN or found.dimension != 2:
         return None
@@ -141,7 +139,7 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     if known:
-        axes.set(xlabel=label("position x", found.unit), ylabel=label("position y", found.unit))
+        axes.set(xlabel=words.label("position x", found.unit), ylabel=words.label("position y", found.unit))
         axes.grid(color="0.92", linewidth=0.8)
         centers = balls.at(places)
         for k in np.flatnonzero(balls.around < 0):
@@ -157,10 +155,10 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     axes.plot(*np.insert(places[found.links], 2, np.nan, axis=1).reshape(-1, 2).T, color=colours.LINK, linewidth=0.9, zorder=2)
     few = found.count <= MOST_ROWS
     for i in range(found.count):
-        shade, shape = (colour(i), marker(i)) if few else (colours.AREA, "o")
+        shade, shape = (colours.colour(i), colours.marker(i)) if few else (colours.AREA, "o")
         axes.plot(*places[i], shape, color=shade, markeredgecolor="white", markersize=8 if few else 4, zorder=3)
         if few:
-            name = plain(str(found.ids[i]), 14)
+            name = words.plain(str(found.ids[i]), 14)
             axes.annotate(name, places[i], (6, 6), textcoords="offset points", color=shade, weight="bold", zorder=4)
     axes.margins(0.12)
     return figure

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
+from consat.errors import counted
 from consat.views.colours import COLOURS, GREY, MARKERS, STYLES
 from consat.views.figures import DPI
 from consat.views.words import plain
@@ -50,8 +51,8 @@ def draw(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Figur
 
 
 def _title(summary: Mapping[str, Any]) -> str:
-    seeds = len(summary["seeds"]) if len(summary["seeds"]) != 2 else summary["seeds"][1]
-    return f"{plain(summary['scenario'])}: {summary['protocol']}, {summary['estimates']} estimates, {seeds:,} seed{'s' * (seeds > 1)}"
+    seeds = counted(summary["groups"][0]["runs"], "seed")
+    return f"{plain(summary['scenario'])}: {summary['protocol']}, {summary['estimates']} estimates, {seeds}"
 
 
 def _unit(summary: Mapping[str, Any]) -> str:
