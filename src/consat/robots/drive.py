@@ -138,11 +138,8 @@ class Drive:
                 faults.append(Fault(("robots", name), f"must be {allowed}, but is {value:g}"))
         if faults:
             raise InvalidInput(faults)
-        object.__setattr__(self, "map", map_of(self.obstacles, self.dimension))
-        size, look, added = _sizes(self)
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "range", look)
-        object.__setattr__(self, "explained", 4.0 * added)
+        for name, value in {"map": map_of(self.obstacles, self.dimension), **_sizes(self)}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def arrives(self) -> Array:
@@ -312,16 +309,14 @@ class Drive:
 
 
 @float64
-def _sizes(drive: Drive) -> tuple[np.ndarray, float, float]:
-    """`size`, `range`, and what is added to radii."""
+def _sizes(drive: Drive) -> dict[str, Any]:
+    """`size`, `range` and `explained`."""
     model, count, dt = drive.model, drive.count, drive.dt
     with jax.ensure_compile_time_eval():
         added = safety.margin(model, count, dt, drive.noise, drive.share)
-        size = np.asarray(model.size(count, dt)) + added
-        if drive.sensing is not None:
-            return size, drive.sensing, added
-        look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
-        return size, float(2.0 * size.max() + look + 2.0 * np.max(np.asarray(model.halting(count, dt)))), added
+        size, pace, halting = (np.asarray(value) for value in (model.size(count, dt), model.pace(count), model.halting(count, dt)))
+    needed = 2.0 * (size + added).max() + pace.max() * max(2.0 * drive.rules.reach, 4.0 * dt) + 2.0 * halting.max()
+    return {"size": size + added, "range": float(needed if drive.sensing is None else drive.sensing), "explained": 4.0 * added}
 
 
 def _row(rows: Array, index: Array) -> Array:
