@@ -34,7 +34,7 @@ def of(simulation: Simulation, agent: str, constraint: str, key: str) -> list[fl
 
 def wall(simulation: Simulation, constraint: str, offset: float) -> None:
     team = simulation._display.scene.team
-    k = next(k for k, own in enumerate(simulation._display.scene.walls) if team.names[own[0]] == constraint)
+    k = next(k for k, own in enumerate(simulation._display.scene.shared[1]) if team.names[own[0]] == constraint)
     simulation._do(orders.Wall(do="wall", scene=simulation._display.scene.number, wall=k, offset=offset), 0)
 
 
@@ -67,7 +67,7 @@ def test_side_beyond_the_other_is_refused(simulation: Simulation) -> None:
 
 
 def test_shared_region_moves_for_all_whose_it_is(simulation: Simulation) -> None:
-    k = next(k for k, own in enumerate(simulation._display.scene.balls) if len(own) == 2)
+    k = next(k for k, own in enumerate(simulation._display.scene.shared[0]) if len(own) == 2)
     simulation._do(orders.Shape(do="shape", scene=simulation._display.scene.number, shape=k, center=[8, 8], radius=2), 0)
     for agent in ("left", "right"):
         assert of(simulation, agent, "bar", "center") == [8, 8]
@@ -75,7 +75,7 @@ def test_shared_region_moves_for_all_whose_it_is(simulation: Simulation) -> None
     with pytest.raises(InvalidTeam, match="radius"):
         simulation._do(orders.Shape(do="shape", scene=simulation._display.scene.number, shape=k, radius=-1), 0)
     simulation._do(orders.Change(do="change", agent="left", constraint="bar", parameters={"radius": 1.5}), 0)
-    assert len([own for own in simulation._display.scene.balls if len(own) == 1]) == 3  # it is shared no more
+    assert len([own for own in simulation._display.scene.shared[0] if len(own) == 1]) == 3  # it is shared no more
     simulation._do(orders.Plain(do="undo"), 0)
     simulation._do(orders.Plain(do="undo"), 0)
     assert of(simulation, "right", "bar", "center") == [9, 9]

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.oracle import problems, solved
 from consat.numerics import quick_compilation
 from consat.robots import Double, Drive, Fleet, Point, Quadrotor, Unicycle, box, conditions, disc, polygon
-from consat.robots.filter import filtered, joined, margin, nearest, neighbour_planes, obstacle_planes
+from consat.robots.filter import joined, margin, nearest, neighbour_planes, obstacle_planes, steered
 from consat.robots.neighbours import Near, candidates, near
 from consat.robots.obstacles import map_of
 
@@ -61,6 +61,11 @@ def packed(rng: np.random.Generator, sizes: np.ndarray, dimension: int, side: fl
         if all(np.linalg.norm(place - other) > sizes[index] + sizes[len(places)] for index, other in enumerate(places)):
             places.append(place)
     return np.array(places)
+
+
+def filtered(model: Any, state: Any, wish: Any, planes: Any, dt: float) -> Any:
+    command, moves, _ = steered(model, state, wish, wish, planes, dt)
+    return command, moves
 
 
 def hunted(model: Any, dimension: int, *, dt: float = DT, share: float = 1.0, seen: int = 8, seed: int = 0, steps: int = 150) -> float:

@@ -16,6 +16,7 @@ from PIL import Image
 import consat as cs
 from consat.errors import InvalidScenario, InvalidSettings
 from consat.runs.sweeping import values
+from consat.views import sweeps
 
 CONSAT = Path(sysconfig.get_path("scripts")) / "consat"
 ALIKE = ("status", "verdict", "ending", "rounds", "messages", "floats_sent")
@@ -105,6 +106,11 @@ def test_wrong_input_is_told() -> None:
         cs.sweep("case-c", {"loss": []})
     with pytest.raises(InvalidSettings, match="no seeds"):
         cs.sweep("case-c", seeds=0)
+
+
+def test_figure_counts_seeds_that_do_not_follow_each_other() -> None:
+    found = cs.sweep("case-b", seeds=[3, 7])
+    assert ", 2 seeds" in sweeps.draw(found.summary, found.runs).axes[0].get_title()
 
 
 def test_command_writes_table_csv_json_and_figure(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.results.trace import Trace, satisfied_from
-from consat.views import animation, colours, figures, scene, words
+from consat.views import animation, colours, figures, regions, scene, words
 
 GREETING = np.array([[2.0, 0.0], [-0.6, 0.0], [-2.0, 0.0]])
 
@@ -151,7 +151,7 @@ def test_region_of_a_tie_is_around_the_teammate_where_it_ends() -> None:
     figure = figures.formation(made(tug(), GREETING))
     centers, radii = GREETING[[0, 0, 2, 2]] * [1, 0], [1.0, 3.0, 2.0, 1.0]
     edges = boundaries(figure)
-    assert [to_hex(edge.get_edgecolor()) for edge in edges] == [figures.colour(i).lower() for i in (0, 1, 1, 2)]
+    assert [to_hex(edge.get_edgecolor()) for edge in edges] == [colours.colour(i).lower() for i in (0, 1, 1, 2)]
     for edge, center, radius in zip(edges, centers, radii, strict=True):
         assert np.linalg.norm(vertices(edge) - center, axis=1) == pytest.approx(radius, abs=cell(figure) ** 2)
 
@@ -168,7 +168,7 @@ def test_nothing_is_shaded_where_constraints_exclude_each_other() -> None:
     end = np.array([[0.98, 0.0], [-0.41, 0.0], [-0.98, 0.0]])
     figure = figures.formation(made(tug(1.4, 0.4), end))
     assert len(boundaries(figure)) == 4
-    assert [to_hex(shade.get_facecolor()) for shade in shadings(figure)] == [figures.colour(i).lower() for i in (0, 2)]
+    assert [to_hex(shade.get_facecolor()) for shade in shadings(figure)] == [colours.colour(i).lower() for i in (0, 2)]
 
 
 def test_ticks_stand_on_the_side_where_the_constraint_fails() -> None:
@@ -218,7 +218,7 @@ def test_regions_move_the_owner_and_nobody_else() -> None:
     team = cs.Team([cs.Agent("a"), cs.Agent("b", [cs.displacement("a", [1, 2], 3, weight=2)])])
     x, points = np.array([[0.5, 0.5], [9.0, 9.0]]), np.array([[0.0, 0.0], [1.5, 2.5], [4.0, -1.0]])
     expected = 2 * (9 - np.sum((points - x[0] - [1, 2]) ** 2, axis=1))
-    assert figures.regions(team, x, points) == pytest.approx(expected[None], rel=1e-14)
+    assert regions.regions(team, x, points) == pytest.approx(expected[None], rel=1e-14)
 
 
 def test_region_in_one_dimension_follows_the_teammate_in_time() -> None:
@@ -248,14 +248,14 @@ def test_paths_lead_from_open_starts_to_filled_ends() -> None:
     lines = figures.formation(result).axes[0].lines
     x = result.data["position"].values
     for i in range(3):
-        mine = [line for line in lines if line.get_color() == figures.colour(i)]
+        mine = [line for line in lines if line.get_color() == colours.colour(i)]
         mine.sort(key=lambda line: ["path", "start", "head"].index(line.get_gid()))
         path, start, end = (line.get_xydata() for line in mine)
         assert np.array_equal(path, x[:, i])
         assert np.array_equal(start, x[:1, i])
         assert np.array_equal(end, x[-1:, i])
         assert mine[1].get_markerfacecolor() == "white"
-        assert mine[2].get_markerfacecolor() == figures.colour(i)
+        assert mine[2].get_markerfacecolor() == colours.colour(i)
 
 
 def test_legend_names_agents_and_constraints() -> None:
@@ -586,7 +586,7 @@ def test_scene_shows_what_is_between_samples() -> None:
     heads = [line for line in shown.axes.lines if line.get_gid() == "head"]
     assert np.concatenate([line.get_xydata() for line in heads]) == pytest.approx(0.75 * x[2] + 0.25 * x[3])
     assert "round 2," in shown.axes.get_title()
-    edge = next(edge for edge in boundaries(shown.figure) if to_hex(edge.get_edgecolor()) == figures.colour(1).lower())
+    edge = next(edge for edge in boundaries(shown.figure) if to_hex(edge.get_edgecolor()) == colours.colour(1).lower())
     assert np.linalg.norm(vertices(edge) - heads[0].get_xydata(), axis=1) == pytest.approx(3.0, abs=cell(shown.figure) ** 2)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from consat.numerics import float64
-from consat.robots.drive import Drive, Report, longest_halt
+from consat.robots.drive import Drive, Report
 from consat.robots.obstacles import overlaps
 
 
@@ -39,7 +39,7 @@ def conditions(
     if wind > 0.0 and _drifts(drive, wind):
         broken.append(f"wind: {wind:g} m/s moves robots by what no command asked for")
     pace, size = np.asarray(model.pace(count)), drive.size
-    least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(longest_halt(model, count, dt)) + 2.0 * drive.noise)
+    least = float(2.0 * size.max() + 2.0 * pace.max() * dt + 2.0 * np.max(np.asarray(model.halting(count, dt))) + 2.0 * drive.noise)
     if drive.sensing is not None and drive.sensing < least:
         broken.append(f"sensing: the range is {drive.sensing:g} m, but must be {least:.4g} m")
     if state is not None:

@@ -70,8 +70,9 @@ class Double:
     def pace(self, count: int) -> Array:
         return each(self.speed, count)
 
-    def braking(self, count: int) -> Array:
-        return each(self.acceleration, count)
+    def halting(self, count: int, dt: float) -> Array:
+        limit = each(self.acceleration, count)
+        return self.pace(count) ** 2 / (2.0 * limit) + limit * dt**2 / 8.0
 
     def command(self, state: DoubleState, velocity: Array, dt: float) -> Array:
         count = len(velocity)

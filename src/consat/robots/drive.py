@@ -95,7 +95,6 @@ class Drive:
         neighbours: largest number of neighbours with a plane of their own. The others only limit the speed.
         parts: largest number of parts of obstacles with a plane of their own.
         sensing: range of the sensors, m; None for the range that `rules` need.
-        tolerance: distance from its target at which a robot has arrived, m; None for its radius.
         rules: parameters of the rules against deadlock.
 
     Attributes:
@@ -118,7 +117,6 @@ class Drive:
     neighbours: int = 8
     parts: int = 4
     sensing: float | None = None
-    tolerance: float | None = None
     rules: Rules = field(default_factory=Rules)
     map: Map = field(init=False)
     size: np.ndarray = field(init=False)
@@ -131,23 +129,22 @@ class Drive:
         if self.dimension not in self.model.dimensions:
             allowed = " or ".join(map(str, self.model.dimensions))
             faults.append(Fault(("robots", "kind"), f"{kind} robots move in {allowed} dimensions, but the team has {self.dimension}"))
-        for name, low in (("dt", 0.0), ("share", 0.0), ("noise", -1.0)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > low) or (name == "share" and value > 1.0) or (name == "noise" and value < 0.0):
-                allowed = {"dt": "positive", "share": "above 0 and at most 1", "noise": "0 or more"}[name]
+        for name, value, fits, allowed in (
+            ("dt", self.dt, self.dt > 0.0, "positive"),
+            ("share", self.share, 0.0 < self.share <= 1.0, "above 0 and at most 1"),
+            ("noise", self.noise, self.noise >= 0.0, "0 or more"),
+        ):
+            if not (math.isfinite(value) and fits):
                 faults.append(Fault(("robots", name), f"must be {allowed}, but is {value:g}"))
         if faults:
             raise InvalidInput(faults)
-        object.__setattr__(self, "map", map_of(self.obstacles, self.dimension))
-        size, look, added = _sizes(self)
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "range", look)
-        object.__setattr__(self, "explained", 4.0 * added)
+        for name, value in {"map": map_of(self.obstacles, self.dimension), **_sizes(self)}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def arrives(self) -> Array:
-        """(N,) distance from its target at which each robot has arrived, m."""
-        return each(self.model.radius if self.tolerance is None else self.tolerance, self.count)
+        """(N,) distance from its target at which each robot has arrived, m: its radius."""
+        return each(self.model.radius, self.count)
 
     def start(self, state: Any) -> Memory:
         """The memory at the start. Its types are those after a step, because a weak type would cause a second compilation."""
@@ -240,10 +237,10 @@ class Drive:
 
     def stuck(self, state: Any, memory: Memory, targets: Array) -> list[int]:
         """Indices of robots that have not arrived and made no progress for `PATIENCE`."""
-        return np.flatnonzero(np.asarray(~self.arrived(state, targets) & (memory.waited > PATIENCE))).tolist()
+        return np.flatnonzero(np.asarray(self.ended(state, memory, targets)[1])).tolist()
 
     def arrived(self, state: Any, targets: Array) -> Array:
-        """(N,) whether each robot is within `tolerance` of its target."""
+        """(N,) whether each robot is at its target; see `arrives`."""
         return jnp.linalg.norm(targets - self.position(state), axis=1) < self.arrives
 
     def position(self, state: Any) -> Array:
@@ -275,22 +272,23 @@ class Drive:
     def _looked_at(self, state: Any, memory: Memory, around: Near) -> Memory:
         """The report with the present bodies, given the nearest neighbours."""
         body, place = self.model.body(state), self.model.place(state)
-        radius, report = each(self.model.radius, self.count), memory.report
-        kept = self.model.size(self.count, self.dt)
-        stray = jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - kept)
-        overlap = report.overlap
+        radius, kept, report = each(self.model.radius, self.count), self.model.size(self.count, self.dt), memory.report
+        there, index = around.who < self.count, jnp.minimum(around.who, self.count - 1)
+        within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
+        gap = jnp.where(there, jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index], jnp.inf)
+        report = report._replace(
+            smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf)),
+            strayed=jnp.maximum(report.strayed, jnp.max(jnp.linalg.norm(body - place, axis=1) + radius - kept)),
+            overlap=jnp.maximum(report.overlap, jnp.max(jnp.where(there, within, 0.0), initial=0.0)),
+        )
         if self.map.count:
             clear = self.map.signed_distance(body) - radius
-            overlap = jnp.maximum(overlap, jnp.max(kept - self.map.signed_distance(place)))
             struck = 0 if isinstance(self.model, Simulated) else jnp.sum(clear < 0.0)
-            report = report._replace(clearance=jnp.minimum(report.clearance, jnp.min(clear)), collisions=report.collisions + struck)
-        index = jnp.minimum(around.who, self.count - 1)
-        within = kept[:, None] + kept[index] - jnp.sqrt(squared(place[:, None] - place[index]))
-        overlap = jnp.maximum(overlap, jnp.max(jnp.where(around.who < self.count, within, 0.0), initial=0.0))
-        report = report._replace(strayed=jnp.maximum(report.strayed, stray), overlap=overlap)
-        gap = jnp.sqrt(squared(body[:, None] - body[index])) - radius[:, None] - radius[index]
-        gap = jnp.where(around.who < self.count, gap, jnp.inf)
-        report = report._replace(smallest_distance=jnp.minimum(report.smallest_distance, jnp.min(gap, initial=jnp.inf)))
+            report = report._replace(
+                clearance=jnp.minimum(report.clearance, jnp.min(clear)),
+                collisions=report.collisions + struck,
+                overlap=jnp.maximum(report.overlap, jnp.max(kept - self.map.signed_distance(place))),
+            )
         if isinstance(self.model, Simulated):  # contacts are the simulator's
             bodies = state.bodies
             touched = memory.touched | bodies.touching if len(memory.touched) else memory.touched
@@ -311,24 +309,14 @@ class Drive:
 
 
 @float64
-def _sizes(drive: Drive) -> tuple[np.ndarray, float, float]:
-    """`size`, `range`, and what is added to radii."""
+def _sizes(drive: Drive) -> dict[str, Any]:
+    """`size`, `range` and `explained`."""
     model, count, dt = drive.model, drive.count, drive.dt
     with jax.ensure_compile_time_eval():
         added = safety.margin(model, count, dt, drive.noise, drive.share)
-        size = np.asarray(model.size(count, dt)) + added
-        if drive.sensing is not None:
-            return size, drive.sensing, added
-        look = np.max(np.asarray(model.pace(count))) * max(2.0 * drive.rules.reach, 4.0 * dt)
-        return size, float(2.0 * size.max() + look + 2.0 * np.max(longest_halt(model, count, dt))), added
-
-
-def longest_halt(model: Model[Any], count: int, dt: float) -> np.ndarray:
-    """(N,) distance of a halt from full speed, m."""
-    if not model.inertial:
-        return np.zeros(count)
-    pace, braking = np.asarray(model.pace(count)), np.asarray(model.braking(count))
-    return pace**2 / (2.0 * braking) + np.where(np.isfinite(braking), braking, 0.0) * dt**2 / 8.0
+        size, pace, halting = (np.asarray(value) for value in (model.size(count, dt), model.pace(count), model.halting(count, dt)))
+    needed = 2.0 * (size + added).max() + pace.max() * max(2.0 * drive.rules.reach, 4.0 * dt) + 2.0 * halting.max()
+    return {"size": size + added, "range": float(needed if drive.sensing is None else drive.sensing), "explained": 4.0 * added}
 
 
 def _row(rows: Array, index: Array) -> Array:

@@ -51,60 +51,34 @@ class Planes(NamedTuple):
     slack: Array
 
 
-def filtered(model: Model[Any], state: Any, wish: Array, planes: Planes, dt: float) -> tuple[Array, Array]:
-    """The command nearest to a wished velocity that keeps every robot on its side of its planes.
+def steered(model: Model[Any], state: Any, wish: Array, straight: Array, planes: Planes, dt: float) -> tuple[Array, Array, Array]:
+    """The commands nearest to wished velocities that keep every robot on its side of its planes.
+
+    A robot halts where there is no such command, or where the model's own step leaves the planes. Also finds the velocity nearest to
+    `straight` within the planes, without limits of acceleration: solved with the first problem as one of 2 N robots, which halves the size
+    of the compiled program.
 
     Args:
         model: model of the robots.
         state: state of the N robots.
         wish: (N, d) wished velocity, m/s.
+        straight: (N, d) second wished velocity, m/s; its speed is the limit of the second problem.
         planes: planes from `neighbour_planes` and `obstacle_planes`, combined by `joined`.
         dt: duration of the command, s.
 
     Returns:
-        (N, m) commands, and (N,) whether the robot moves on; where False, the command is a halt.
-    """
-    center, radius = model.reach(state, dt)
-    rows = model.rows(state, planes.normals, planes.least, dt) - along(planes.normals, center)
-    change, there = nearest(shortened(wish, model.bounded(planes.slack, dt)) - center, planes.normals, rows, radius)
-    return _checked(model, state, center + change, there, planes, dt)
-
-
-def steered(model: Model[Any], state: Any, wish: Array, straight: Array, planes: Planes, dt: float) -> tuple[Array, Array, Array]:
-    """As `filtered`, and also the velocity nearest to `straight` within the planes, without limits of acceleration.
-
-    Both problems are solved as one problem of 2 N robots, which halves the size of the compiled program.
-
-    Args:
-        model: as in `filtered`.
-        state: as in `filtered`.
-        wish: as in `filtered`.
-        straight: (N, d) second wished velocity, m/s; its speed is the limit of the second problem.
-        planes: as in `filtered`.
-        dt: as in `filtered`.
-
-    Returns:
         (N, m) commands, (N,) whether the robot moves on, and (N, d) the velocity nearest to `straight`, m/s; 0 if there is none.
     """
-    center, radius = model.reach(state, dt)
+    count, (center, radius) = len(wish), model.reach(state, dt)
     limits = model.rows(state, planes.normals, planes.least, dt)
     wishes = jnp.concatenate([shortened(wish, model.bounded(planes.slack, dt)) - center, straight])
     normals = jnp.concatenate([planes.normals, planes.normals])
     rows = jnp.concatenate([limits - along(planes.normals, center), limits])
     found, there = nearest(wishes, normals, rows, jnp.concatenate([radius, jnp.linalg.norm(straight, axis=1)]))
-    count = len(wish)
-    return *_checked(model, state, center + found[:count], there[:count], planes, dt), found[count:]
-
-
-def _checked(model: Model[Any], state: Any, velocity: Array, there: Array, planes: Planes, dt: float) -> tuple[Array, Array]:
-    """The command for a velocity (N, d), and whether the robot moves on, (N,).
-
-    The command is a halt where the problem has no solution (`there` is False) or the model's own step leaves the planes.
-    """
-    command = model.command(state, velocity, dt)
+    command = model.command(state, center + found[:count], dt)
     kept = jnp.all(model.lowest(state, command, planes.normals, dt) >= planes.least - ROUNDING, axis=1)
-    moves = there & kept & (model.farthest(state, command, dt) <= planes.slack + ROUNDING)
-    return jnp.where(moves[:, None], command, model.halt(state, dt)), moves
+    moves = there[:count] & kept & (model.farthest(state, command, dt) <= planes.slack + ROUNDING)
+    return jnp.where(moves[:, None], command, model.halt(state, dt)), moves, found[count:]
 
 
 def neighbour_planes(place: Array, stop: Array | None, size: Array, near: Near, share: float = 1.0, *, explained: float = np.inf) -> Planes:

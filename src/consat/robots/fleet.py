@@ -52,22 +52,23 @@ class Fleet:
 
     @property
     def radius(self) -> np.ndarray:
-        return self._host(lambda model, count: np.broadcast_to(np.asarray(model.radius), (count,)))
+        parts = [np.broadcast_to(model.radius, len(rows)) for model, rows in zip(self.models, self.members, strict=True)]
+        return np.concatenate(parts)[np.argsort(np.concatenate(self.members))]
 
     def start(self, position: Array) -> tuple[Any, ...]:
         return tuple(model.start(position[rows]) for model, rows in zip(self.models, self.members, strict=True))
 
     def place(self, state: tuple[Any, ...]) -> Array:
-        return self._joined([model.place(part) for model, part in zip(self.models, state, strict=True)])
+        return self._mapped(lambda model, part, rows: model.place(part), state)
 
     def body(self, state: tuple[Any, ...]) -> Array:
-        return self._joined([model.body(part) for model, part in zip(self.models, state, strict=True)])
+        return self._mapped(lambda model, part, rows: model.body(part), state)
 
     def heading(self, state: tuple[Any, ...]) -> Array:
-        return self._joined([model.heading(part) for model, part in zip(self.models, state, strict=True)])
+        return self._mapped(lambda model, part, rows: model.heading(part), state)
 
     def stop(self, state: tuple[Any, ...], dt: float) -> Array:
-        return self._joined([model.stop(part, dt) for model, part in zip(self.models, state, strict=True)])
+        return self._mapped(lambda model, part, rows: model.stop(part, dt), state)
 
     def velocity(self, state: tuple[Any, ...], command: Array) -> Array:
         return self._mapped(lambda model, part, rows: model.velocity(part, self._own(model, part, command[rows])), state)
@@ -78,8 +79,8 @@ class Fleet:
     def pace(self, count: int) -> Array:
         return self._joined([model.pace(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
 
-    def braking(self, count: int) -> Array:
-        return self._joined([model.braking(len(rows)) for model, rows in zip(self.models, self.members, strict=True)])
+    def halting(self, count: int, dt: float) -> Array:
+        return self._joined([model.halting(len(rows), dt) for model, rows in zip(self.models, self.members, strict=True)])
 
     def command(self, state: tuple[Any, ...], velocity: Array, dt: float) -> Array:
         return self._mapped(lambda model, part, rows: model.command(part, velocity[rows], dt), state)
@@ -125,7 +126,3 @@ class Fleet:
             width = max(part.shape[1] for part in parts)
             parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
         return jnp.concatenate(parts)[np.argsort(np.concatenate(self.members))]
-
-    def _host(self, function: Callable[[Model[Any], int], np.ndarray]) -> np.ndarray:
-        parts = [function(model, len(rows)) for model, rows in zip(self.models, self.members, strict=True)]
-        return np.concatenate(parts)[np.argsort(np.concatenate(self.members))]

@@ -1,4 +1,4 @@
-"""Interface of all robot models, and the check of their parameters.
+"""Interface of all robot models, the two bases that models share, and the check of their parameters.
 
 A model holds parameters only; the state is passed in and returned. All functions compute N robots at once and can be traced by JAX; a
 process of one robot has N = 1. Positions have shape (N, d), in metres; times are in seconds and angles in radians.
@@ -7,9 +7,7 @@ process of one robot has N = 1. Positions have shape (N, d), in metres; times ar
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-import operator
 from typing import Any, Generic, Protocol, TypeVar
 
 import jax.numpy as jnp
@@ -17,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from consat.errors import Fault, InvalidInput, shown
+from consat.numerics import add_up
 
 Number = float | np.ndarray
 """A parameter: one number for all robots, or one for each, (N,)."""
@@ -71,8 +70,8 @@ class Model(Protocol, Generic[S]):
     def pace(self, count: int) -> Array:
         """(N,) speed limit, m/s."""
 
-    def braking(self, count: int) -> Array:
-        """(N,) deceleration of a halt, m/s²; infinite if a robot halts at once."""
+    def halting(self, count: int, dt: float) -> Array:
+        """(N,) distance of a halt from full speed, m."""
 
     def command(self, state: S, velocity: Array, dt: float) -> Array:
         """(N, m) command within the limits whose mean velocity over `dt` is `velocity`; if out of reach, with the same direction."""
@@ -102,6 +101,94 @@ class Model(Protocol, Generic[S]):
         """Center (N, d) and radius (N,) of a ball of velocities that can be reached within `dt`."""
 
 
+class Instant(Model[S]):
+    """Base of models that halt at once: what the filter asks follows from `place` and `step`."""
+
+    inertial = False
+    speed: Number
+
+    def stop(self, state: S, dt: float) -> Array:
+        return self.place(state)
+
+    def pace(self, count: int) -> Array:
+        return each(self.speed, count)
+
+    def halting(self, count: int, dt: float) -> Array:
+        return jnp.zeros(count)
+
+    def lowest(self, state: S, command: Array, normals: Array, dt: float) -> Array:
+        return along(normals, self.place(self.step(state, command, dt)))
+
+    def rows(self, state: S, normals: Array, least: Array, dt: float) -> Array:
+        return (least - along(normals, self.place(state))) / dt
+
+    def farthest(self, state: S, command: Array, dt: float) -> Array:
+        return jnp.linalg.norm(self.place(self.step(state, command, dt)) - self.place(state), axis=1)
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        return slack / dt
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        return jnp.minimum(self.pace(len(distance)), distance / (2.0 * dt))
+
+    def reach(self, state: S, dt: float) -> tuple[Array, Array]:
+        place = self.place(state)
+        return jnp.zeros_like(place), self.pace(len(place))
+
+
+class Following(Model[Any]):
+    """Base of models whose bodies follow a reference. Commands move the reference, and the filter keeps references apart.
+
+    Attributes:
+        reference: model of the references. Its state is the entry `reference` of the state.
+    """
+
+    reference: Model[Any]
+
+    @property
+    def inertial(self) -> bool:
+        return self.reference.inertial
+
+    def place(self, state: Any) -> Array:
+        return self.reference.place(state.reference)
+
+    def velocity(self, state: Any, command: Array) -> Array:
+        return self.reference.velocity(state.reference, command)
+
+    def stop(self, state: Any, dt: float) -> Array:
+        return self.reference.stop(state.reference, dt)
+
+    def pace(self, count: int) -> Array:
+        return self.reference.pace(count)
+
+    def halting(self, count: int, dt: float) -> Array:
+        return self.reference.halting(count, dt)
+
+    def command(self, state: Any, velocity: Array, dt: float) -> Array:
+        return self.reference.command(state.reference, velocity, dt)
+
+    def halt(self, state: Any, dt: float) -> Array:
+        return self.reference.halt(state.reference, dt)
+
+    def lowest(self, state: Any, command: Array, normals: Array, dt: float) -> Array:
+        return self.reference.lowest(state.reference, command, normals, dt)
+
+    def rows(self, state: Any, normals: Array, least: Array, dt: float) -> Array:
+        return self.reference.rows(state.reference, normals, least, dt)
+
+    def farthest(self, state: Any, command: Array, dt: float) -> Array:
+        return self.reference.farthest(state.reference, command, dt)
+
+    def bounded(self, slack: Array, dt: float) -> Array:
+        return self.reference.bounded(slack, dt)
+
+    def approach(self, distance: Array, dt: float) -> Array:
+        return self.reference.approach(distance, dt)
+
+    def reach(self, state: Any, dt: float) -> tuple[Array, Array]:
+        return self.reference.reach(state.reference, dt)
+
+
 def each(value: Number, count: int) -> Array:
     """(N,) values of a parameter, one for each robot."""
     return jnp.broadcast_to(jnp.asarray(value, dtype=jnp.float64), (count,))
@@ -115,7 +202,7 @@ def shortened(vectors: Array, limit: Array) -> Array:
 
 def along(normals: Array, points: Array) -> Array:
     """(N, k) n·x for k vectors (N, k, d) and one point (N, d) of each robot."""
-    return functools.reduce(operator.add, [normals[:, :, axis] * points[:, axis][:, None] for axis in range(points.shape[1])])
+    return dot(normals, points[:, None])
 
 
 def squared(vectors: Array) -> Array:
@@ -125,7 +212,7 @@ def squared(vectors: Array) -> Array:
 
 def dot(first: Array, second: Array) -> Array:
     """(…, d) → (…)."""
-    return functools.reduce(operator.add, [first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
+    return add_up([first[..., axis] * second[..., axis] for axis in range(first.shape[-1])])
 
 
 def checked(model: Any) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from consat.errors import InvalidSettings
 from consat.robots.double import DoubleState
@@ -58,24 +59,14 @@ REST, LAG = 0.01, 0.025
 """Drive: constant part of the tube, m, and time that multiplies the speed, s."""
 
 
-class _Physics(NamedTuple):
-    """State of N robots in MuJoCo. Missing entries are padded with 0.
-
-    Attributes:
-        place: (N, 9) position, unit quaternion, angles of two wheels.
-        speed: (N, 8) velocity in the world frame, turn rate in the body frame, turn rates of two wheels.
-        warm: (N, 8) last accelerations, the initial guess of the contact solver.
-        push: (N, 3) acceleration of quadrotors against the wind, m/s².
-    """
-
-    place: np.ndarray
-    speed: np.ndarray
-    warm: np.ndarray
-    push: np.ndarray
+COLUMNS = {"place": 9, "speed": 8, "warm": 8, "push": 3}
+"""Columns of `Bodies.inner`, padded with 0. Place: position, unit quaternion, angles of two wheels. Speed: velocity in the world frame,
+turn rate in the body frame, turn rates of two wheels. Warm: last accelerations, the initial guess of the contact solver. Push: acceleration
+of quadrotors against the wind, m/s²."""
 
 
 class _Now(NamedTuple):
-    """Measurements of n robots of a kind: as in `_Physics`, and attitude, (n, 3, 3); mass, (n,), kg; inertia, (n, 3), kg m²."""
+    """Measurements of n robots of a kind: as in `COLUMNS`, and attitude, (n, 3, 3); mass, (n,), kg; inertia, (n, 3), kg m²."""
 
     place: np.ndarray
     speed: np.ndarray
@@ -137,7 +128,7 @@ class Simulator:
         InvalidSettings: MuJoCo is not installed, or a kind of robot has no body here.
     """
 
-    width = sum((9, 8, 8, 3))
+    width = sum(COLUMNS.values())
 
     def __init__(self, model: Model[Any], count: int, dimension: int, obstacles: Sequence[Any]) -> None:
         try:
@@ -168,20 +159,17 @@ class Simulator:
 
     def start(self, place: np.ndarray) -> Bodies:
         count = len(place)
-        physics = _Physics(np.zeros((count, 9)), np.zeros((count, 8)), np.zeros((count, 8)), np.zeros((count, 3)))
-        physics.place[:, : self._dimension] = place
-        physics.place[:, 0] -= self._each(lambda group: group.kind.offset if isinstance(group.kind, Unicycle) else 0.0)
-        physics.place[:, 3] = 1.0
-        apart = np.zeros((count, count), dtype=bool)
-        return Bodies(
-            physics.place[:, :3], physics.speed[:, :3], np.zeros(count), np.concatenate(physics, axis=1), apart, apart.any(axis=1)
-        )
+        inner, apart = np.zeros((count, self.width)), np.zeros((count, count), dtype=bool)
+        inner[:, : self._dimension] = place
+        inner[:, 0] -= self._each(lambda group: group.kind.offset if isinstance(group.kind, Unicycle) else 0.0)
+        inner[:, 3] = 1.0
+        return Bodies(inner[:, :3], np.zeros((count, 3)), np.zeros(count), inner, apart, apart.any(axis=1))
 
     def step(self, bodies: Bodies, before: Any, after: Any, wind: np.ndarray, *, dt: float) -> Bodies:
         model, data, groups, count = self._model, self._data, self._groups, len(bodies.heading)
         steps = max(math.ceil(dt / group.design.step - 1e-9) for group in groups)
         model.opt.timestep = hold = dt / steps
-        place, speed, warm, push = (part.copy() for part in np.split(bodies.inner, [9, 17, 25], axis=1))
+        place, speed, warm, push = (part.copy() for part in np.split(bodies.inner, np.cumsum(list(COLUMNS.values()))[:-1], axis=1))
         place[:, 2] += self._height
         self._place.write(data.qpos, place)
         self._speed.write(data.qvel, speed)
@@ -202,8 +190,8 @@ class Simulator:
                 self._look(touching, struck)
         place[:, 2] -= self._height
         heading = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
-        physics = _Physics(place, speed, self._speed.read(data.qacc_warmstart), push)
-        return Bodies(place[:, :3], speed[:, :3], heading, np.concatenate(physics, axis=1), touching, struck)
+        inner = np.concatenate([place, speed, self._speed.read(data.qacc_warmstart), push], axis=1)
+        return Bodies(place[:, :3], speed[:, :3], heading, inner, touching, struck)
 
     def _look(self, touching: np.ndarray, struck: np.ndarray) -> None:
         """Record contacts between two robots, and between a robot and an obstacle."""
@@ -421,10 +409,4 @@ def _across(ahead: np.ndarray) -> np.ndarray:
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices, (N, 3, 3), of quaternions, (N, 4)."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()

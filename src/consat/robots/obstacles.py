@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -27,20 +27,7 @@ HALVINGS = 40
 
 
 @dataclass(frozen=True)
-class Obstacle:
-    """Base class of obstacles. Use `disc`, `box` or `polygon` to make one.
-
-    Attributes:
-        dimension: dimension of the space that it lies in, 2 or 3.
-    """
-
-    @property
-    def dimension(self) -> int:
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Disc(Obstacle):
+class Disc:
     """A disc, or a ball in space; see `disc`."""
 
     center: tuple[float, ...]
@@ -52,7 +39,7 @@ class Disc(Obstacle):
 
 
 @dataclass(frozen=True)
-class Box(Obstacle):
+class Box:
     """An axis-aligned box; see `box`."""
 
     low: tuple[float, ...]
@@ -64,14 +51,15 @@ class Box(Obstacle):
 
 
 @dataclass(frozen=True)
-class Polygon(Obstacle):
+class Polygon:
     """A simple polygon, clockwise or counter-clockwise; see `polygon`."""
 
     vertices: tuple[tuple[float, float], ...]
+    dimension: ClassVar[int] = 2
 
-    @property
-    def dimension(self) -> int:
-        return 2
+
+Obstacle: TypeAlias = Disc | Box | Polygon
+"""An obstacle. Its `dimension` is that of the space in which it lies, 2 or 3. Use `disc`, `box` or `polygon` to make one."""
 
 
 def disc(center: Sequence[float], radius: float) -> Disc:
@@ -85,7 +73,7 @@ def disc(center: Sequence[float], radius: float) -> Disc:
         InvalidInput: one line for each argument that cannot be used.
     """
     faults: list[Fault] = []
-    place = _vector(center, (2, 3), "center", "obstacle 'disc'", faults)
+    place = _vector(center, "center", "obstacle 'disc'", faults)
     size = _number(radius, "radius", "obstacle 'disc'", faults)
     if faults:
         raise InvalidInput(faults)
@@ -103,7 +91,7 @@ def box(low: Sequence[float], high: Sequence[float]) -> Box:
         InvalidInput: one line for each argument that cannot be used.
     """
     where, faults = "obstacle 'box'", list[Fault]()
-    below, above = _vector(low, (2, 3), "low", where, faults), _vector(high, (2, 3), "high", where, faults)
+    below, above = _vector(low, "low", where, faults), _vector(high, "high", where, faults)
     if not faults and len(below) != len(above):
         faults.append(Fault(("high",), f"must have as many numbers as low, {len(below)}, but has {len(above)}", f"{where}, high"))
     elif not faults and not all(a < b for a, b in zip(below, above, strict=True)):
@@ -148,24 +136,21 @@ def polygon(vertices: Sequence[Sequence[float]]) -> Polygon:
 def _crossing(points: np.ndarray) -> str:
     """Text of the fault that names two edges which cross or touch."""
     edges = [shapely.LineString([a, b]) for a, b in zip(points, np.roll(points, -1, axis=0), strict=True)]
-    count = len(edges)
-    for first in range(count):
-        for second in range(first + 1, count):
-            shared = shapely.intersection(edges[first], edges[second])
-            adjoining = (second - first) % count in {1, count - 1}
-            if (not adjoining and not shared.is_empty) or (adjoining and shared.length > 0.0):
-                return f"must be those of a polygon that does not cross itself, but edges {first} and {second} meet"
+    for first, second in itertools.combinations(range(len(edges)), 2):
+        shared = shapely.intersection(edges[first], edges[second])
+        adjoining = second - first in {1, len(edges) - 1}
+        if shared.length > 0.0 if adjoining else not shared.is_empty:
+            return f"must be those of a polygon that does not cross itself, but edges {first} and {second} meet"
     return "must be those of a polygon that does not cross itself"
 
 
-def _vector(value: Any, lengths: tuple[int, ...], name: str, where: str, faults: list[Fault]) -> tuple[float, ...]:
+def _vector(value: Any, name: str, where: str, faults: list[Fault]) -> tuple[float, ...]:
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         array = np.zeros(0)
-    if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
-        either = " or ".join(map(str, lengths))
-        faults.append(Fault((name,), f"must be {either} finite numbers, but is {shown(value)}", f"{where}, {name}"))
+    if array.ndim != 1 or len(array) not in (2, 3) or not np.isfinite(array).all():
+        faults.append(Fault((name,), f"must be 2 or 3 finite numbers, but is {shown(value)}", f"{where}, {name}"))
         return ()
     return tuple(array.tolist())
 
@@ -209,8 +194,8 @@ class Map:
     def distances(self, points: Array) -> Array:
         """(N, P) signed distance from points (N, d) to each part, m; negative inside discs and boxes. An edge has no inside."""
         point = points[:, None]
-        rounds = jnp.linalg.norm(point - jnp.asarray(self.centers)[None], axis=2) - jnp.asarray(self.radii)[None]
-        outside = jnp.maximum(jnp.asarray(self.lows)[None] - point, point - jnp.asarray(self.highs)[None])
+        rounds = jnp.linalg.norm(point - self.centers[None], axis=2) - self.radii[None]
+        outside = jnp.maximum(self.lows[None] - point, point - self.highs[None])
         squared = jnp.sum(jnp.maximum(outside, 0.0) ** 2, axis=2)
         out = squared > 0.0  # the square root has no derivative at 0
         boxes = jnp.where(out, jnp.sqrt(jnp.where(out, squared, 1.0)), jnp.max(outside, axis=2, initial=-jnp.inf))
@@ -294,10 +279,9 @@ class Map:
     def _inside(self, points: Array, first: int, last: int) -> Array:
         """(N,) whether points are inside the polygon: a ray to the right crosses its edges `first` to `last` − 1 an odd number of times."""
         x, y = points[:, :1], points[:, 1:2]
-        a, b = jnp.asarray(self.begins[first:last]), jnp.asarray(self.ends[first:last])
-        crosses = (a[:, 1][None] > y) != (b[:, 1][None] > y)
-        height = b[:, 1] - a[:, 1]
-        at = a[:, 0][None] + (y - a[:, 1][None]) * ((b[:, 0] - a[:, 0]) / jnp.where(height == 0.0, 1.0, height))[None]
+        (left, low), (right, high) = self.begins[first:last].T[:, None], self.ends[first:last].T[:, None]
+        crosses = (low > y) != (high > y)
+        at = left + (y - low) * ((right - left) / np.where(high == low, 1.0, high - low))
         return jnp.sum(crosses & (x < at), axis=1) % 2 == 1
 
 
@@ -309,7 +293,7 @@ def map_of(obstacles: Sequence[Obstacle], dimension: int) -> Map:
     """
     faults = []
     for index, each in enumerate(obstacles):
-        if not isinstance(each, (Disc, Box, Polygon)):
+        if not isinstance(each, Obstacle):
             text = f"must be made by disc, box or polygon, but is {shown(each)}"
             faults.append(Fault(("obstacles", index), text, f"obstacle {index}"))
         elif each.dimension != dimension:
@@ -337,10 +321,6 @@ def map_of(obstacles: Sequence[Obstacle], dimension: int) -> Map:
     )
 
 
-def _off(distance: float) -> str:
-    return f"{distance:.4g} m" if distance > 0.0 else "inside one"
-
-
 @float64
 def start_faults(names: Sequence[str], starts: np.ndarray, size: np.ndarray, obstacles: Map) -> list[Fault]:
     """Faults of start positions: too near an obstacle, or bodies that overlap.
@@ -354,7 +334,8 @@ def start_faults(names: Sequence[str], starts: np.ndarray, size: np.ndarray, obs
     faults = []
     clearance = np.asarray(obstacles.signed_distance(jnp.asarray(starts))) - size
     for index in np.flatnonzero(clearance < 0.0).tolist():
-        off = _off(clearance[index] + size[index])
+        distance = clearance[index] + size[index]
+        off = f"{distance:.4g} m" if distance > 0.0 else "inside one"
         text = f"start {starts[index].tolist()} must be {size[index]:g} m or more from every obstacle, but is {off}"
         faults.append(Fault(("agents", index, "start"), text, f"agent {names[index]!r}"))
     for first, second, distance in overlaps(starts, size):
@@ -368,7 +349,7 @@ def overlaps(places: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, f
     """Yield each pair of robots that overlap, and their distance, m. places: (N, d), m; size: (N,) radii, m."""
     from scipy.spatial import cKDTree
 
-    for first, second in sorted(cKDTree(places).query_pairs(2.0 * float(np.max(size)))) if len(places) > 1 else ():
+    for first, second in sorted(cKDTree(places).query_pairs(2.0 * size.max(initial=0.0))):
         distance = float(np.linalg.norm(places[first] - places[second]))
         if distance < size[first] + size[second]:
             yield int(first), int(second), distance

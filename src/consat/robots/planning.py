@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,8 @@ from scipy.sparse.csgraph import dijkstra
 from consat.numerics import float64
 from consat.robots.obstacles import Map
 
+CLEARANCE = 0.25
+"""Additional distance of planned paths from obstacles, relative to the size."""
 CORNERS = 2
 """Segments that approximate a quarter circle of a grown obstacle's outline."""
 CELLS = 40_000
@@ -31,26 +32,16 @@ SAMPLES = 128
 """Number of samples of a straight way in space; of a long way, a multiple of it."""
 
 
-@dataclass(frozen=True, eq=False)
 class Planner:
     """Plans paths for bodies of one size on one map.
 
     Args:
         obstacles: map of the obstacles.
         size: radius that a robot keeps free, m.
-        clearance: additional distance of planned paths from obstacles, m; None for a quarter of the size.
     """
 
-    obstacles: Map
-    size: float
-    clearance: float | None = None
-    _roads: _Roads | _Grid = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        clearance = 0.25 * self.size if self.clearance is None else self.clearance
-        plane = self.obstacles.dimension == 2
-        roads = _Roads(self.obstacles, self.size, clearance) if plane else _Grid(self.obstacles, self.size, clearance)
-        object.__setattr__(self, "_roads", roads)
+    def __init__(self, obstacles: Map, size: float) -> None:
+        self._roads = _Roads(obstacles, size) if obstacles.dimension == 2 else _Grid(obstacles, size)
 
     def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """(W, d) waypoints from a start, (d,), to a goal, (d,). The last waypoint is the goal.
@@ -77,7 +68,8 @@ class Planner:
 class _Roads:
     """Visibility graph of the corners of grown obstacles in the plane."""
 
-    def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
+    def __init__(self, obstacles: Map, size: float) -> None:
+        clearance = CLEARANCE * size
         shapes = [
             shapely.Point(*center).buffer(radius, quad_segs=16) for center, radius in zip(obstacles.centers, obstacles.radii, strict=True)
         ]
@@ -98,7 +90,6 @@ class _Roads:
         length = np.linalg.norm(self.corners[first] - self.corners[second], axis=1)
         count = len(self.corners)
         self.graph = csr_array(coo_array((np.r_[length, length], (np.r_[first, second], np.r_[second, first])), shape=(count, count)))
-        self.trees: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def _clear(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """(M,) whether the straight way from each point (M, 2) to another (M, 2) is clear of all walls."""
@@ -161,7 +152,8 @@ class _Roads:
 class _Grid:
     """Grid graph in space. Each free node is connected to its free neighbours among the 26 around it."""
 
-    def __init__(self, obstacles: Map, size: float, clearance: float) -> None:
+    def __init__(self, obstacles: Map, size: float) -> None:
+        kept = (1.0 + CLEARANCE) * size
         self.signed_distance, self.size = jax.jit(obstacles.signed_distance), size
         corners = np.concatenate(
             [obstacles.centers - obstacles.radii[:, None], obstacles.centers + obstacles.radii[:, None], obstacles.lows, obstacles.highs]
@@ -169,13 +161,13 @@ class _Grid:
         if len(corners) == 0:
             self.nodes = np.zeros((0, 3))
             return
-        around = 3.0 * (size + clearance)
+        around = 3.0 * kept
         low, high = corners.min(axis=0) - around, corners.max(axis=0) + around
         self.step = max(float(np.prod(high - low) / CELLS) ** (1 / 3), 0.5 * size)
         axes = [np.arange(a, b + self.step, self.step) for a, b in zip(low, high, strict=True)]
         shape = tuple(map(len, axes))
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        free = self._distance(nodes) > size + clearance
+        free = self._distance(nodes) > kept
         number = np.arange(len(nodes)).reshape(shape)
         rows, columns = [], []
         for move in itertools.product((-1, 0, 1), repeat=3):

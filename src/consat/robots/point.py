@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from consat.robots.model import Number, along, checked, each, shortened
+from consat.robots.model import Instant, Number, checked, each, shortened
 
 
 class PointState(NamedTuple):
@@ -18,7 +18,7 @@ class PointState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class Point(Instant[PointState]):
     """A body that obeys velocity commands at once.
 
     Args:
@@ -33,7 +33,6 @@ class Point:
     speed: Number = 0.5
 
     dimensions = (1, 2, 3)
-    inertial = False
 
     def __post_init__(self) -> None:
         checked(self)
@@ -53,17 +52,8 @@ class Point:
     def heading(self, state: PointState) -> Array:
         return jnp.zeros(len(state.position))
 
-    def stop(self, state: PointState, dt: float) -> Array:
-        return state.position
-
     def size(self, count: int, dt: float) -> Array:
         return each(self.radius, count)
-
-    def pace(self, count: int) -> Array:
-        return each(self.speed, count)
-
-    def braking(self, count: int) -> Array:
-        return jnp.full(count, jnp.inf)
 
     def command(self, state: PointState, velocity: Array, dt: float) -> Array:
         return shortened(velocity, self.pace(len(velocity)))
@@ -74,21 +64,3 @@ class Point:
     def step(self, state: PointState, command: Array, dt: float, wind: Array | None = None) -> PointState:
         velocity = shortened(command, self.pace(len(command)))
         return PointState(state.position + dt * (velocity if wind is None else velocity + wind))
-
-    def lowest(self, state: PointState, command: Array, normals: Array, dt: float) -> Array:
-        return along(normals, self.step(state, command, dt).position)
-
-    def rows(self, state: PointState, normals: Array, least: Array, dt: float) -> Array:
-        return (least - along(normals, state.position)) / dt
-
-    def farthest(self, state: PointState, command: Array, dt: float) -> Array:
-        return jnp.linalg.norm(self.place(self.step(state, command, dt)) - self.place(state), axis=1)
-
-    def bounded(self, slack: Array, dt: float) -> Array:
-        return slack / dt
-
-    def approach(self, distance: Array, dt: float) -> Array:
-        return jnp.minimum(self.pace(len(distance)), distance / (2.0 * dt))
-
-    def reach(self, state: PointState, dt: float) -> tuple[Array, Array]:
-        return jnp.zeros_like(state.position), self.pace(len(state.position))

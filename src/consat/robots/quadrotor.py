@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.spatial.transform import Rotation
 
 from consat.errors import Fault, InvalidInput
 from consat.robots.double import Double, DoubleState
-from consat.robots.model import Number, checked, each
+from consat.robots.model import Following, Number, checked, each
 
 GRAVITY = 9.81
 """m/s²."""
@@ -46,7 +47,7 @@ class QuadrotorState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Quadrotor:
+class Quadrotor(Following):
     """A quadrotor in space, or, in the plane, at a constant height.
 
     Args:
@@ -67,63 +68,36 @@ class Quadrotor:
     tube: Number = 0.06
 
     dimensions = (2, 3)
-    inertial = True
 
     def __post_init__(self) -> None:
         checked(self)
+        object.__setattr__(self, "reference", Double(self.radius, self.speed, self.acceleration))
         least = np.arctan(1.25 * np.asarray(self.acceleration) / GRAVITY)
         if np.any(np.asarray(self.tilt) < least):
             text = f"must be at least {float(np.max(least)):.3f} rad for an acceleration of {np.max(self.acceleration):g} m/s²"
             raise InvalidInput([Fault(("tilt",), f"{text}, but is {np.min(self.tilt):g}", "robot 'quadrotor', tilt")])
 
-    @property
-    def outer(self) -> Double:
-        """The reference as a model."""
-        return Double(self.radius, self.speed, self.acceleration)
-
     def start(self, position: Array) -> QuadrotorState:
         count = len(position)
         whole = _in_space(position)
         level = jnp.broadcast_to(jnp.eye(3), (count, 3, 3))
-        return QuadrotorState(whole, jnp.zeros_like(whole), level, self.outer.start(position))
-
-    def place(self, state: QuadrotorState) -> Array:
-        return state.reference.position
+        return QuadrotorState(whole, jnp.zeros_like(whole), level, self.reference.start(position))
 
     def body(self, state: QuadrotorState) -> Array:
         return state.position[:, : state.reference.position.shape[1]]
 
-    def velocity(self, state: QuadrotorState, command: Array) -> Array:
-        return state.reference.velocity
-
     def heading(self, state: QuadrotorState) -> Array:
         return jnp.arctan2(state.attitude[:, 1, 0], state.attitude[:, 0, 0])
 
-    def stop(self, state: QuadrotorState, dt: float) -> Array:
-        return self.outer.stop(state.reference, dt)
-
     def size(self, count: int, dt: float) -> Array:
         return each(self.radius, count) + each(self.tube, count)
-
-    def pace(self, count: int) -> Array:
-        return each(self.speed, count)
-
-    def braking(self, count: int) -> Array:
-        return each(self.acceleration, count)
-
-    def command(self, state: QuadrotorState, velocity: Array, dt: float) -> Array:
-        """(N, d) acceleration of the reference."""
-        return self.outer.command(state.reference, velocity, dt)
-
-    def halt(self, state: QuadrotorState, dt: float) -> Array:
-        return self.outer.halt(state.reference, dt)
 
     def step(self, state: QuadrotorState, command: Array, dt: float, wind: Array | None = None) -> QuadrotorState:
         """The inner loop at 200 Hz or more; the reference moves exactly."""
         count = max(1, math.ceil(dt / INNER_STEP - 1e-9))
         inner = dt / count
         air = jnp.zeros_like(state.position) if wind is None else _in_space(wind)
-        reference = self.outer.step(state.reference, command, dt)
+        reference = self.reference.step(state.reference, command, dt)
         old, new = _in_space(state.reference.velocity), _in_space(reference.velocity)
         begin, pull = _in_space(state.reference.position), (new - old) / dt
 
@@ -135,7 +109,7 @@ class Quadrotor:
             up = attitude[:, :, 2]
             force = thrust[:, None] * up - jnp.array([[0.0, 0.0, GRAVITY]]) - DRAG * (velocity - air)
             after = velocity + inner * force
-            return position + 0.5 * inner * (velocity + after), after, attitude @ _rotation(inner * rates)
+            return position + 0.5 * inner * (velocity + after), after, attitude @ Rotation.from_rotvec(inner * rates).as_matrix()
 
         position, velocity, attitude = jax.lax.fori_loop(0, count, one, (state.position, state.velocity, state.attitude))
         return QuadrotorState(position, velocity, attitude, reference)
@@ -169,38 +143,7 @@ class Quadrotor:
         rates = rates * xp.where(speed > TURN_RATE, TURN_RATE / xp.where(speed > 0.0, speed, 1.0), 1.0)[:, None]
         return xp.maximum(xp.sum(force * attitude[:, :, 2], axis=1), 0.0), rates
 
-    def lowest(self, state: QuadrotorState, command: Array, normals: Array, dt: float) -> Array:
-        return self.outer.lowest(state.reference, command, normals, dt)
-
-    def rows(self, state: QuadrotorState, normals: Array, least: Array, dt: float) -> Array:
-        return self.outer.rows(state.reference, normals, least, dt)
-
-    def farthest(self, state: QuadrotorState, command: Array, dt: float) -> Array:
-        return self.outer.farthest(state.reference, command, dt)
-
-    def bounded(self, slack: Array, dt: float) -> Array:
-        return self.outer.bounded(slack, dt)
-
-    def approach(self, distance: Array, dt: float) -> Array:
-        return self.outer.approach(distance, dt)
-
-    def reach(self, state: QuadrotorState, dt: float) -> tuple[Array, Array]:
-        return self.outer.reach(state.reference, dt)
-
 
 def _in_space(vectors: Array) -> Array:
     """(N, d) → (N, 3)."""
     return jnp.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
-
-
-def _rotation(vectors: Array) -> Array:
-    """(N, 3) rotation vectors → (N, 3, 3) (Rodrigues)."""
-    angle = jnp.linalg.norm(vectors, axis=1)
-    small = angle < 1e-9
-    axis = vectors / jnp.where(small, 1.0, angle)[:, None]
-    x, y, z = axis.T
-    zero = jnp.zeros_like(x)
-    skew = jnp.stack([jnp.stack([zero, -z, y], 1), jnp.stack([z, zero, -x], 1), jnp.stack([-y, x, zero], 1)], axis=1)
-    sine, rest = jnp.sin(angle)[:, None, None], (1.0 - jnp.cos(angle))[:, None, None]
-    turned = jnp.eye(3)[None] + sine * skew + rest * (skew @ skew)
-    return jnp.where(small[:, None, None], jnp.eye(3)[None], turned)

@@ -20,9 +20,8 @@ from jax import Array
 
 from consat.errors import InvalidSettings, closest
 from consat.numerics import on_host
-from consat.robots.double import Double
 from consat.robots.fleet import Fleet
-from consat.robots.model import Model, shortened
+from consat.robots.model import Following, Model, shortened
 from consat.robots.quadrotor import Quadrotor
 
 SIMULATORS: Final = ("mujoco",)
@@ -84,7 +83,7 @@ class SimulatedState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
+class Simulated(Following):
     """A robot model whose bodies are in a simulator; see `simulated`.
 
     Args:
@@ -102,19 +101,12 @@ class Simulated:
         return self.reference.dimensions
 
     @property
-    def inertial(self) -> bool:
-        return self.reference.inertial
-
-    @property
     def radius(self) -> Any:
         return self.reference.radius
 
     def start(self, position: Array) -> SimulatedState:
         bodies = on_host(self.simulator.start, self._shapes(len(position)), position)
         return SimulatedState(self.reference.start(position), bodies)
-
-    def place(self, state: SimulatedState) -> Array:
-        return self.reference.place(state.reference)
 
     def position(self, state: SimulatedState) -> Array:
         """(N, d) points that constraints read, measured in the simulator: as far from the body's centre as in the reference."""
@@ -128,20 +120,8 @@ class Simulated:
     def heading(self, state: SimulatedState) -> Array:
         return state.bodies.heading
 
-    def velocity(self, state: SimulatedState, command: Array) -> Array:
-        return self.reference.velocity(state.reference, command)
-
-    def stop(self, state: SimulatedState, dt: float) -> Array:
-        return self.reference.stop(state.reference, dt)
-
     def size(self, count: int, dt: float) -> Array:
         return self.reference.size(count, dt) + jnp.asarray(self.simulator.tube)
-
-    def pace(self, count: int) -> Array:
-        return self.reference.pace(count)
-
-    def braking(self, count: int) -> Array:
-        return self.reference.braking(count)
 
     def command(self, state: SimulatedState, velocity: Array, dt: float) -> Array:
         """The command of the reference, no faster than its body can be after `dt`, so that the body is not left behind."""
@@ -157,9 +137,6 @@ class Simulated:
         place = self.reference.place(reference)
         return jnp.linalg.norm(body - place, axis=1) - jnp.linalg.norm(self.reference.body(reference) - place, axis=1)
 
-    def halt(self, state: SimulatedState, dt: float) -> Array:
-        return self.reference.halt(state.reference, dt)
-
     def step(self, state: SimulatedState, command: Array, dt: float, wind: Array | None = None) -> SimulatedState:
         """Move the reference by its model, unless its body is behind; then the body, by the simulator. Wind acts on the body only."""
         before, body = state.reference, self.body(state)
@@ -170,24 +147,6 @@ class Simulated:
 
         follow = functools.partial(self.simulator.step, dt=dt)
         return SimulatedState(after, on_host(follow, self._shapes(len(body)), state.bodies, before, after, air))
-
-    def lowest(self, state: SimulatedState, command: Array, normals: Array, dt: float) -> Array:
-        return self.reference.lowest(state.reference, command, normals, dt)
-
-    def rows(self, state: SimulatedState, normals: Array, least: Array, dt: float) -> Array:
-        return self.reference.rows(state.reference, normals, least, dt)
-
-    def farthest(self, state: SimulatedState, command: Array, dt: float) -> Array:
-        return self.reference.farthest(state.reference, command, dt)
-
-    def bounded(self, slack: Array, dt: float) -> Array:
-        return self.reference.bounded(slack, dt)
-
-    def approach(self, distance: Array, dt: float) -> Array:
-        return self.reference.approach(distance, dt)
-
-    def reach(self, state: SimulatedState, dt: float) -> tuple[Array, Array]:
-        return self.reference.reach(state.reference, dt)
 
     def _shapes(self, count: int) -> Bodies:
         real = {"position": (count, 3), "velocity": (count, 3), "heading": (count,), "inner": (count, self.simulator.width)}
@@ -226,13 +185,11 @@ def _reference(model: Model[Any]) -> Model[Any]:
     """The model of the reference. A quadrotor follows a double integrator."""
     if isinstance(model, Fleet):
         return Fleet([_reference(kind) for kind in model.models], model.kinds)
-    return Double(model.radius, model.speed, model.acceleration) if isinstance(model, Quadrotor) else model
+    return model.reference if isinstance(model, Quadrotor) else model
 
 
 def _turned(vectors: Array, angle: Array) -> Array:
     """Vectors (N, d), turned in the plane by angles (N,)."""
-    if vectors.shape[1] == 1:
-        return vectors
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     x, y = vectors[:, 0], vectors[:, 1]
     return jnp.concatenate([jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1), vectors[:, 2:]], axis=1)

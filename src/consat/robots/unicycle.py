@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from consat.robots.model import Number, along, checked, each, shortened
+from consat.robots.model import Instant, Number, checked, each, shortened
 
 NEWTON_STEPS = 6
 """Number of iterations for the direction of the chord. With l > speed·dt/2, the third changes no digit any more."""
@@ -27,7 +27,7 @@ class UnicycleState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Unicycle:
+class Unicycle(Instant[UnicycleState]):
     """A differential drive.
 
     Args:
@@ -46,13 +46,12 @@ class Unicycle:
     offset: Number = 0.05
 
     dimensions = (2,)
-    inertial = False
 
     def __post_init__(self) -> None:
         checked(self)
 
-    def start(self, position: Array, angle: Array | None = None) -> UnicycleState:
-        heading = jnp.zeros(len(position)) if angle is None else angle
+    def start(self, position: Array) -> UnicycleState:
+        heading = jnp.zeros(len(position))
         return UnicycleState(position - each(self.offset, len(position))[:, None] * _ahead(heading), heading)
 
     def place(self, state: UnicycleState) -> Array:
@@ -69,18 +68,9 @@ class Unicycle:
     def heading(self, state: UnicycleState) -> Array:
         return state.angle
 
-    def stop(self, state: UnicycleState, dt: float) -> Array:
-        return self.place(state)
-
     def size(self, count: int, dt: float) -> Array:
         """Radius and offset, and the height of the arc over its chord."""
         return each(self.radius, count) + each(self.offset, count) + each(self.speed, count) * each(self.turn_rate, count) * (dt**2 / 8.0)
-
-    def pace(self, count: int) -> Array:
-        return each(self.speed, count)
-
-    def braking(self, count: int) -> Array:
-        return jnp.full(count, jnp.inf)
 
     def command(self, state: UnicycleState, velocity: Array, dt: float) -> Array:
         """(v, ω) with the ratio that makes the chord of the arc point along `velocity`: φ' + ω(φ') dt/2 = φ, angles from the heading."""
@@ -109,24 +99,6 @@ class Unicycle:
         half = 0.5 * dt * command[:, 1]
         chord = dt * command[:, 0] * jnp.sinc(half / jnp.pi)
         return UnicycleState(state.axle + chord[:, None] * _ahead(state.angle + half), state.angle + 2.0 * half)
-
-    def lowest(self, state: UnicycleState, command: Array, normals: Array, dt: float) -> Array:
-        return along(normals, self.place(self.step(state, command, dt)))
-
-    def rows(self, state: UnicycleState, normals: Array, least: Array, dt: float) -> Array:
-        return (least - along(normals, self.place(state))) / dt
-
-    def farthest(self, state: UnicycleState, command: Array, dt: float) -> Array:
-        return jnp.linalg.norm(self.place(self.step(state, command, dt)) - self.place(state), axis=1)
-
-    def bounded(self, slack: Array, dt: float) -> Array:
-        return slack / dt
-
-    def approach(self, distance: Array, dt: float) -> Array:
-        return jnp.minimum(self.pace(len(distance)), distance / (2.0 * dt))
-
-    def reach(self, state: UnicycleState, dt: float) -> tuple[Array, Array]:
-        return jnp.zeros_like(state.axle), self.pace(len(state.angle))
 
 
 def _ahead(angle: Array) -> Array:

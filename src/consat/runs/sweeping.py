@@ -67,10 +67,10 @@ class Sweep:
         return [target / "sweep.json", target / "sweep.csv", self.plot(target / "sweep.png")]
 
     def plot(self, path: str | os.PathLike[str]) -> Path:
-        """Write the figure: rounds to satisfaction, margin and success over the parameter; see `consat.views.spread`. Returns its path."""
-        from consat.views import spread
+        """Write the figure: rounds to satisfaction, margin and success over the parameter; see `consat.views.sweeps`. Returns its path."""
+        from consat.views import sweeps
 
-        return spread.save(self.summary, self.runs, path)
+        return sweeps.save(self.summary, self.runs, path)
 
     def __str__(self) -> str:
         from consat.views import words

@@ -21,6 +21,7 @@ from consat.server.page import page
 from consat.server.simulation import Simulation
 
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+"""Names of this machine, by which a page is served without a token."""
 
 
 class Watcher(Client):
@@ -45,11 +46,10 @@ class Host:
     Args:
         simulation: the simulation.
         token: token that the address must end with; None if only this machine can connect.
-        hosts: names of the server that are accepted without a token.
     """
 
-    def __init__(self, simulation: Simulation, token: str | None = None, hosts: tuple[str, ...] = LOOPBACK) -> None:
-        self.simulation, self._token, self._hosts = simulation, token, hosts
+    def __init__(self, simulation: Simulation, token: str | None = None) -> None:
+        self.simulation, self._token = simulation, token
         self._clients: dict[int, Watcher] = {}
         self._numbers = itertools.count()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -80,7 +80,7 @@ class Host:
             name = urlsplit(f"//{host}").hostname
         except ValueError:
             name = None
-        return None if name in self._hosts else "this server answers to addresses of this machine only"
+        return None if name in LOOPBACK else "this server answers to addresses of this machine only"
 
     async def page(self, request: Request) -> Response:
         """Serve the page."""

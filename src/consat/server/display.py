@@ -18,7 +18,7 @@ from consat.server import frames
 from consat.server.background import Background
 from consat.server.board import Board
 from consat.server.scene import Scene
-from consat.server.targets import CENTERS, place_of
+from consat.server.targets import CENTERS, family_of
 
 MOST_PATCHED: Final = 50
 """Most balls that are shown one by one. If more have changed, the scene is shown anew."""
@@ -68,7 +68,7 @@ class Display:
     def restructure(self, session: Session) -> None:
         """Show the scene anew. It keeps its number if its agents and shapes are the same, so that a page goes on holding a shape."""
         old, scene = self.scene, Scene.of(self.scene.number + 1, session.team.at(session.time), session.positions, self._robots)
-        same = (old.team.ids, old.balls, old.walls) == (scene.team.ids, scene.balls, scene.walls)
+        same = (old.team.ids, old.shared) == (scene.team.ids, scene.shared)
         self.show_scene(session, scene._replace(number=old.number) if same else scene)
 
     def show_scene(self, session: Session, scene: Scene) -> None:
@@ -81,16 +81,17 @@ class Display:
     def reshape(self, session: Session, numbers: set[int]) -> None:
         """Show the present regions of some constraints, given by their indices in the team."""
         scene, team = self.scene, session.team.at(session.time)
-        hit = [k for k, own in enumerate(scene.balls) if not numbers.isdisjoint(own)]
-        if any(not numbers.issuperset(scene.balls[k]) for k in hit) or len({*self._patches, *hit}) > MOST_PATCHED:
+        balls, walls = scene.shared
+        hit = [k for k, own in enumerate(balls) if not numbers.isdisjoint(own)]
+        if any(not numbers.issuperset(balls[k]) for k in hit) or len({*self._patches, *hit}) > MOST_PATCHED:
             self.restructure(session)
             return
         for k in hit:
-            family, m = place_of(team, scene.balls[k][0])
+            family, m = family_of(team, balls[k][0])
             given = {key: value[m] for key, value in family.parameters.items()}
             center = given.get(CENTERS.get(family.kind, ""), np.zeros(team.dimension))
             self._patches[k] = {"center": np.asarray(center).tolist(), "radius": float(given["radius"])}
-        if any(not numbers.isdisjoint(own) for own in scene.walls):
+        if any(not numbers.isdisjoint(own) for own in walls):
             moved = scene.moved(team)
             if moved is None:
                 self.restructure(session)

@@ -100,16 +100,17 @@ class Editor:
 
     def _do_parameters(self, order: Order, gesture: Gesture) -> None:
         scene = self.display.scene
+        balls, walls = scene.shared
         match order:
             case orders.Change():
                 numbers = named(self.session.team, order.agent, order.constraint)
                 self._change([Target(order.agent, order.constraint, numbers)], order.parameters, gesture)
             case orders.Shape():
-                self._require_scene(order.scene, order.shape, len(scene.balls))
-                self._change(*targets.ball(scene.team, scene.balls[order.shape], order.center, order.radius), gesture)
+                self._require_scene(order.scene, order.shape, len(balls))
+                self._change(*targets.ball(scene.team, balls[order.shape], order.center, order.radius), gesture)
             case orders.Wall():
-                self._require_scene(order.scene, order.wall, len(scene.walls))
-                self._change(*targets.wall(self.session.team, scene.walls[order.wall], order.offset), gesture)
+                self._require_scene(order.scene, order.wall, len(walls))
+                self._change(*targets.wall(self.session.team, walls[order.wall], order.offset), gesture)
             case _:
                 pass
 

@@ -27,9 +27,8 @@ def packed(scene: int, round_: int, margin: float, positions: np.ndarray, margin
         headings: (N,) headings, rad; None if there are none.
     """
     x = positions[:, :3]
-    turned = 0 if headings is None else 1
+    parts = [x, margins] if headings is None else [x, margins, headings]
     with np.errstate(over="ignore"):
-        parts = [x, margins] + ([] if headings is None else [headings])
         body = b"".join(np.ascontiguousarray(part, dtype="<f4").tobytes() for part in parts)
     margin = float(np.clip(margin, -3e38, 3e38)) if np.isfinite(margin) else margin
-    return HEADER.pack(KIND, x.shape[1], turned, round_ % 2**32, margin, scene) + body
+    return HEADER.pack(KIND, x.shape[1], headings is not None, round_ % 2**32, margin, scene) + body

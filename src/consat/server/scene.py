@@ -10,9 +10,9 @@ import numpy as np
 
 from consat.problem.team import Team
 from consat.scenario.robots import Robots, obstacle_data
-from consat.views import bodies, picture
-from consat.views.outlines import MOST, outlines
-from consat.views.shapes import Shapes, moves, shapes
+from consat.views import bodies, page_data
+from consat.views.regions import MOST_TRACED, outlines
+from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 MOST_LISTED: Final = 2000
 """Most constraints that are listed on the page."""
@@ -25,8 +25,6 @@ class Scene(NamedTuple):
         number: number of the scene, which frames repeat.
         team: the team, with its present constraints.
         shapes: geometry of the constraints.
-        balls: for each ball, the indices of its constraints.
-        walls: for each half-space, the indices of its constraints.
         low: (p,) lower corner of the box to show, p at most 3.
         high: (p,) upper corner.
     """
@@ -34,8 +32,6 @@ class Scene(NamedTuple):
     number: int
     team: Team
     shapes: Shapes
-    balls: list[list[int]]
-    walls: list[list[int]]
     low: np.ndarray
     high: np.ndarray
 
@@ -44,16 +40,19 @@ class Scene(NamedTuple):
         """The scene of a team at positions x, (N, d)."""
         paths = x[None, :, :3]
         stand = None if robots is None or paths.shape[2] < 2 else bodies.bounds(robots.obstacles, paths.shape[2])
-        low, high = picture.frame(team, paths, stand=stand)
-        drawn = team if len(team.owner) <= picture.MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
-        found = shapes(drawn)
-        return cls(number, team, found, *picture.constraints_of(drawn, found), low, high)
+        low, high = page_data.frame(team, paths, stand=stand)
+        drawn = team if len(team.owner) <= MOST_SHAPES else team.with_constraints([], team.owner[:0], ())
+        return cls(number, team, shapes(drawn), low, high)
+
+    @property
+    def shared(self) -> tuple[list[list[int]], list[list[int]]]:
+        """The indices of the constraints of each ball, and of each half-space."""
+        return self.shapes.balls.numbers, self.shapes.walls.numbers
 
     def moved(self, team: Team) -> Scene | None:
         """The scene with the half-spaces of `team`; None if other constraints share them now."""
-        found = shapes(team)
-        balls, walls = picture.constraints_of(team, found)
-        return self._replace(team=team, shapes=found) if (balls, walls) == (self.balls, self.walls) else None
+        scene = self._replace(team=team, shapes=shapes(team))
+        return scene if scene.shared == self.shared else None
 
     def text(self, name: str, robots: Robots | None) -> str:
         """The scene as JSON."""
@@ -79,16 +78,16 @@ class Scene(NamedTuple):
 
     def told_balls(self) -> list[dict[str, Any]]:
         """The balls as plain data."""
-        return picture.balls_of(self.team, self.shapes, self.balls)
+        return page_data.balls_of(self.team, self.shapes.balls)
 
     def told_walls(self) -> list[Mapping[str, Any]]:
         """The half-spaces as plain data."""
-        return picture.walls_of(self.team, self.shapes.walls, self.walls, self.low, self.high)
+        return page_data.walls_of(self.team, self.shapes.walls, self.low, self.high)
 
     def traced(self, team: Team, x: np.ndarray) -> str | None:
         """The boundaries of other ψ as JSON; None if there are none to trace."""
         numbers = self.shapes.others
-        if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+        if team.dimension != 2 or not 0 < len(numbers) <= MOST_TRACED:
             return None
         ties = moves(team)[numbers]
         lines = outlines(team, numbers.tolist(), x, self.low, self.high)

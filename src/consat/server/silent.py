@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consat.errors import Fault, InvalidTeam, closest, shown
 from consat.problem.agent import Agent
+from consat.problem.changes import place_of
 from consat.problem.constraints.record import OWNER, Constraint, flatten
 from consat.problem.team import Team
 
@@ -31,10 +31,7 @@ class Silent(NamedTuple):
     @classmethod
     def of(cls, team: Team, name: str, x: np.ndarray) -> Silent:
         """What is needed to bring an agent back, with the team at x (N, d). Raises: InvalidTeam: there is no such agent."""
-        if name not in team.ids:
-            raise InvalidTeam([Fault((), f"there is no such agent in the team{closest(name, team.ids)}", f"agent {shown(name)}")])
-        agents = list(team.agents)
-        place = list(team.ids).index(name)
+        place, agents = place_of(team, name), list(team.agents)
         readers = [
             (each.id, constraint)
             for each in agents

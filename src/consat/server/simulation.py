@@ -56,21 +56,25 @@ class Simulation:
 
     Args:
         team: a `consat.Team`, a scenario, or the name of one.
-        notify: called when the board has news, from other threads.
         settings: arguments of the session, such as ``protocol`` and ``seed``; see `consat.Session`.
+
+    Attributes:
+        name: name of the scenario.
+        notify: called when the board has news, from other threads.
 
     Raises:
         ConsatError: as `consat.Session`.
     """
 
-    def __init__(self, team: Team | Scenario | str, notify: Callable[[], None] = lambda: None, **settings: Any) -> None:
-        scenario, self.notify = scenario_of(team), notify
+    def __init__(self, team: Team | Scenario | str, **settings: Any) -> None:
+        scenario = scenario_of(team)
         self.name = scenario.name
+        self.notify: Callable[[], None] = lambda: None
         self._orders: deque[Pending] = deque()
         self._wake, self._open, self._watched = threading.Condition(), True, 0
         self._playing, self._speed, self._owed = True, SPEED, 0
         self._busy: str | None = None
-        self._editor = Editor(scenario, settings, self._notify, self._say_busy)
+        self._editor = Editor(scenario, settings, lambda: self.notify(), self._say_busy)  # noqa: PLW0108 - `notify` is set later
         self._display = self._editor.display
         self._display.show_round(self._editor.session)
         self._display.reassess(self._editor.session)
@@ -191,9 +195,6 @@ class Simulation:
                 self._editor.do(order, None if order.gesture is None else (client, order.gesture))
         self._show_state()
         return {}
-
-    def _notify(self) -> None:
-        self.notify()
 
     def _say_busy(self, what: str) -> None:
         self._busy = what

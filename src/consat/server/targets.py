@@ -32,11 +32,9 @@ class Target(NamedTuple):
     numbers: list[int]
 
 
-def ball(
-    team: Team, numbers: list[int], center: Sequence[float] | None, radius: float | None
-) -> tuple[list[Target], dict[str, Any]]:  # fmt: skip
+def ball(team: Team, numbers: list[int], center: Sequence[float] | None, radius: float | None) -> tuple[list[Target], dict[str, Any]]:
     """The constraints that share a ball, and their parameters for another centre or radius; None leaves it."""
-    family, _ = place_of(team, numbers[0])
+    family, _ = family_of(team, numbers[0])
     parameters: dict[str, Any] = {} if radius is None else {"radius": radius}
     if center is not None:
         if family.kind not in CENTERS:
@@ -47,7 +45,7 @@ def ball(
 
 def wall(team: Team, numbers: list[int], offset: float) -> tuple[list[Target], dict[str, Any]]:
     """The constraints that share a half-space, and their parameters for another offset along its unit normal."""
-    family, k = place_of(team, numbers[0])
+    family, k = family_of(team, numbers[0])
     given = {key: value[k] for key, value in family.parameters.items()}
     targets = _targets(team, numbers)
     if "normal" in given:
@@ -65,10 +63,8 @@ def _targets(team: Team, numbers: list[int]) -> list[Target]:
     return [Target(team.ids[team.owner[number]], team.names[number], [number]) for number in numbers]
 
 
-def place_of(team: Team, number: int) -> tuple[Family, int]:
+def family_of(team: Team, number: int) -> tuple[Family, int]:
     """The family of a constraint, and its row."""
-    if not 0 <= number < len(team.owner):
-        raise InvalidTeam([Fault((), f"there is no constraint of number {number}", "team")])
     f, row = team.slots[number].tolist()
     return team.families[f], row
 
@@ -77,10 +73,8 @@ def parameters_of(team: Team, numbers: Sequence[int], keys: Sequence[str]) -> di
     """Present values of some parameters of a constraint, schedules included."""
     found: dict[str, Any] = {}
     for number in numbers:
-        family, k = place_of(team, number)
-        for key in keys:
-            if key == "weight":
-                found[key] = float(family.weight[k])
-            elif key in family.parameters:
-                found[key] = parameter(team, number, key)
+        family, k = family_of(team, number)
+        found |= {key: parameter(team, number, key) for key in keys if key in family.parameters}
+        if "weight" in keys:
+            found["weight"] = float(family.weight[k])
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -55,8 +56,8 @@ def save(
         raise InvalidSettings(f"a film ends in {' or '.join(FORMATS)}, but {target} doesn't; write {target.with_suffix('.gif')}")
     if "position" not in result.data:
         raise InvalidSettings("nobody's positions were recorded, so there is nothing to show; run with --record all")
-    if suffix == ".mp4":
-        _encoder()
+    if suffix == ".mp4" and find_spec("av") is None:
+        raise InvalidSettings("an MP4 needs PyAV; install it with: pip install 'consat[video]' (a GIF needs nothing)")
     target.parent.mkdir(parents=True, exist_ok=True)
     count = max(2, round(seconds * fps))
     shown = frames(result, count, fps, progress)
@@ -118,14 +119,6 @@ def _gif(target: Path, shown: Sequence[np.ndarray], fps: int) -> None:
     ends = np.round(np.arange(len(shown) + 1) * 100 / fps)  # durations in a GIF are multiples of 10 ms
     durations = (10 * np.diff(ends)).astype(int).tolist()
     pictures[0].save(target, save_all=True, append_images=pictures[1:], duration=durations, loop=0)
-
-
-def _encoder() -> None:
-    """Raises: InvalidSettings: PyAV is not installed."""
-    from importlib.util import find_spec
-
-    if find_spec("av") is None:
-        raise InvalidSettings("an MP4 needs PyAV; install it with: pip install 'consat[video]' (a GIF needs nothing)")
 
 
 def _mp4(target: Path, shown: Iterator[np.ndarray], fps: int) -> None:

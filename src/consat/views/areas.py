@@ -7,24 +7,23 @@ frame only replaces their paths.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from contourpy import FillType, LineType, contour_generator
 from matplotlib.artist import Artist
+from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 
 from consat.problem.team import Team
-from consat.views.figures import STYLES, colour
+from consat.views.colours import STYLES, colour_of
+from consat.views.regions import EMPTY, contours, filled
 from consat.views.shapes import BALLS, alike, moves
 
-SHARED: Final = "0.3"
-"""Colour of regions that several agents share."""
 HATCH: Final = "////"
 TINT, SHADE = 0.15, 0.16
 
@@ -54,11 +53,6 @@ class Area:
     style: Any
 
 
-def colour_of(owners: Sequence[int]) -> str:
-    """Colour of a region: that of its owner; `SHARED` for several owners."""
-    return colour(owners[0]) if len(owners) == 1 else SHARED
-
-
 def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
     """The distinct regions of a team.
 
@@ -76,19 +70,13 @@ def areas(team: Team, values: np.ndarray | None = None) -> list[Area]:
         rank = ranks[int(owners[number])].setdefault(name, len(ranks[int(owners[number])]))
         keeps_out, leaves = BALLS.get(kind, False), False
         if values is not None:
-            edge = values[number][_edge(values.shape[1:])]
-            keeps_out = keeps_out or bool((values[number] < 0).any() and (edge > 0).all())
+            psi = values[number]
+            edge = np.concatenate([psi[0], psi[-1], psi[:, 0], psi[:, -1]])
+            keeps_out = keeps_out or bool((psi < 0).any() and (edge > 0).all())
             leaves = bool(not keeps_out and (edge > 0).any() and (edge < 0).any())
         style = "-" if keeps_out else STYLES[rank % len(STYLES)]
         found.append(Area(number, name, mine, keeps_out, leaves, bool(ties[number]), colour_of(mine), style))
     return found
-
-
-def _edge(shape: tuple[int, ...]) -> np.ndarray:
-    """Mask of the points on the border of a grid of this shape."""
-    edge = np.ones(shape, dtype=bool)
-    edge[(slice(1, -1),) * len(shape)] = False
-    return edge
 
 
 class Ground:
@@ -134,16 +122,15 @@ class Ground:
             up: (L,) grid coordinates on the vertical axis.
             values: (M, L, K) weighted ψ, NaN where not finite.
         """
-        some = len(across) > 1
         for numbers, patch in self._common:
-            patch.set_path(filled(across, up, values[numbers].min(axis=0)) if some else Path(np.zeros((0, 2))))
+            patch.set_path(filled(across, up, values[numbers].min(axis=0)))
         for area, edge, ticks in zip(self.found, self._edges, self._ticks, strict=True):
             psi = values[area.number]
-            lines = list(contours(across, up, psi)) if some else []
-            edge.set_path(Path.make_compound_path(*map(Path, lines)) if lines else Path(np.zeros((0, 2))))
+            lines = list(contours(across, up, psi))
+            edge.set_path(Path.make_compound_path(*map(Path, lines)))
             ticks.set_path(_strokes(lines if area.leaves else [], self._unit))
             if area.keeps_out:
-                self._keep_outs[area.number].set_path(filled(across, up, -psi) if some else Path(np.zeros((0, 2))))
+                self._keep_outs[area.number].set_path(filled(across, up, -psi))
 
 
 def _weight(area: Area) -> dict[str, float]:
@@ -152,7 +139,7 @@ def _weight(area: Area) -> dict[str, float]:
 
 
 def _patch(axes: Any, gid: str, **style: Any) -> PathPatch:
-    patch = PathPatch(Path(np.zeros((0, 2))), gid=gid, **style)
+    patch = PathPatch(EMPTY, gid=gid, **style)
     axes.add_artist(patch)
     return patch
 
@@ -169,28 +156,19 @@ def keep_out_style(shade: Any) -> dict[str, Any]:
     return {"facecolor": to_rgba(shade, SHADE), "edgecolor": to_rgba(shade, 0.75), "hatch": HATCH, "linewidth": 0.0}
 
 
+def discs(axes: Any, centers: np.ndarray, radii: np.ndarray, **style: Any) -> EllipseCollection:
+    """Add discs of radii (K,) at centers (K, 2) to the axes, as one artist."""
+    place: dict[str, Any] = {"units": "xy", "angles": 0.0, "offsets": centers, "offset_transform": axes.transData}
+    found = EllipseCollection(2 * radii, 2 * radii, **place, **style)
+    axes.add_collection(found, autolim=False)
+    return found
+
+
 def legend_patch(shade: Any, label: str) -> Patch:
     """Legend entry for a keep-out."""
     patch = Patch(**keep_out_style(shade), label=label)
     patch.set_hatch_linewidth(0.7)
     return patch
-
-
-def contours(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Polylines (P, 2) on which values (L, K) are zero, the higher values on their left. A closed line ends at its first point."""
-    if np.nanmin(values, initial=0.0) < 0 < np.nanmax(values, initial=0.0):
-        lines: Any = contour_generator(across, up, np.ma.masked_invalid(values), line_type=LineType.Separate).lines(0.0)
-        yield from lines
-
-
-def filled(across: np.ndarray, up: np.ndarray, values: np.ndarray) -> Path:
-    """Path around the points where values (L, K) are positive."""
-    top = float(np.nanmax(values, initial=0.0))
-    if top <= 0:
-        return Path(np.zeros((0, 2)))
-    found: Any = contour_generator(across, up, np.ma.masked_invalid(values), fill_type=FillType.OuterCode).filled(0.0, 2 * top)
-    pieces = [Path(outline, code) for outline, code in zip(*found, strict=True)]
-    return Path.make_compound_path(*pieces) if pieces else Path(np.zeros((0, 2)))
 
 
 def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
@@ -204,12 +182,10 @@ def _strokes(lines: Sequence[np.ndarray], unit: np.ndarray) -> Path:
         right = (ahead - foot)[:, ::-1] * [1.0, -1.0]
         found.append(np.stack([foot, foot + right / np.maximum(np.hypot(*right.T), 1e-300)[:, None] / 80], axis=1) * unit)
     segments = np.concatenate(found)
-    if not len(segments):
-        return Path(np.zeros((0, 2)))
     return Path(segments.reshape(-1, 2), np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments)))
 
 
-def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> list[Artist]:
+def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offset: float, shade: Any) -> None:
     """Draw the boundary of a half-space normal·x ≤ offset in the plane, with ticks on its forbidden side.
 
     Args:
@@ -219,17 +195,11 @@ def wall(axes: Any, low: np.ndarray, high: np.ndarray, normal: np.ndarray, offse
         normal: (2,) unit vector towards the forbidden side.
         offset: distance of the boundary from the origin, along `normal`.
         shade: colour.
-
-    Returns:
-        the artists: the line and its ticks.
     """
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     foot = middle - (middle @ normal - offset) * normal
     along = np.array([-normal[1], normal[0]]) * size
     line = np.stack([foot - along, foot + along])  # the forbidden side is to its right
     unit = np.full(2, float((high - low).max()))
-    edge = Line2D(*line.T, color=shade, linewidth=1.2, zorder=2, gid="boundary")
-    ticks = PathPatch(_strokes([line], unit), fill=False, edgecolor=shade, linewidth=0.8, zorder=2, gid="ticks")
-    for artist in (edge, ticks):
-        axes.add_artist(artist)
-    return [edge, ticks]
+    axes.add_artist(Line2D(*line.T, color=shade, linewidth=1.2, zorder=2, gid="boundary"))
+    _patch(axes, "ticks", fill=False, edgecolor=shade, linewidth=0.8, zorder=2).set_path(_strokes([line], unit))

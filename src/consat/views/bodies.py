@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
@@ -16,9 +15,13 @@ from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from consat.results.result import Result
-from consat.robots.obstacles import Box, Disc, Obstacle, Polygon
+from consat.robots.obstacles import Box, Disc, Obstacle
 from consat.scenario.robots import Robots
+from consat.views.areas import discs
 from consat.views.space import sphere
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SOLID: Final = "0.62"
 """Colour of obstacles. Only obstacles are solid grey; keep-outs are hatched."""
@@ -65,23 +68,16 @@ class Bodies:
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def machines(result: Result) -> Robots | None:
-    """The robots and the obstacles in the summary of a run; None if the run had no robot layer."""
-    told = result.summary.get("robots")
+def robots(result: Result, data: xr.Dataset) -> tuple[Bodies | None, tuple[Obstacle, ...]]:
+    """The bodies of the agents in `data`, the recorded steps of a result, and the obstacles; None and () if the run had no robot layer."""
+    summary = result.summary
+    told = summary.get("robots")
     if told is None:
-        return None
+        return None, ()
     common = {key: value for key, value in told.items() if key != "own"}
-    return Robots.of({"robots": common, "obstacles": result.summary.get("obstacles") or [], "own": told.get("own", {})})
-
-
-def bodies(result: Result, data: Any) -> Bodies | None:
-    """The bodies of the agents in `data`, an `xarray.Dataset` of the result; None if the run had no robot layer."""
-    known = machines(result)
-    if known is None:
-        return None
+    known = Robots.of({"robots": common, "obstacles": summary.get("obstacles") or [], "own": told.get("own", {})})
     radius, offset = sizes(known, [str(agent) for agent in data["agent"].values])
-    heading = data["heading"].values if "heading" in data else None
-    return Bodies(radius, offset, heading, offset > 0)
+    return Bodies(radius, offset, data["heading"].values if "heading" in data else None, offset > 0), known.obstacles
 
 
 def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -89,12 +85,6 @@ def sizes(known: Robots, ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     models = [known.own.get(name, known.common) for name in ids]
     radius, offset = ([float(np.max(getattr(model, name, 0.0))) for model in models] for name in ("radius", "offset"))
     return np.array(radius, dtype=float), np.array(offset, dtype=float)
-
-
-def obstacles(result: Result) -> tuple[Obstacle, ...]:
-    """The obstacles of a run; empty if it had no robot layer."""
-    known = machines(result)
-    return () if known is None else known.obstacles
 
 
 def bounds(found: Sequence[Obstacle], axes: int) -> np.ndarray:
@@ -108,7 +98,6 @@ def _bounds(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray]:
         return np.array(obstacle.center) - obstacle.radius, np.array(obstacle.center) + obstacle.radius
     if isinstance(obstacle, Box):
         return np.array(obstacle.low), np.array(obstacle.high)
-    assert isinstance(obstacle, Polygon)
     return np.min(obstacle.vertices, axis=0), np.max(obstacle.vertices, axis=0)
 
 
@@ -120,7 +109,6 @@ def outline(obstacle: Obstacle) -> Path:
         (left, bottom), (right, top) = obstacle.low, obstacle.high
         corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     else:
-        assert isinstance(obstacle, Polygon)
         corners = list(obstacle.vertices)
     return Path([*corners, corners[0]], closed=True)
 
@@ -161,11 +149,8 @@ class Crew:
 
     def __init__(self, axes: Any, found: Bodies, shades: Sequence[Any] | None) -> None:
         self._found = found
-        size = 2 * found.radius
-        look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0, "zorder": 4.5}
-        offsets = np.zeros((len(size), 2))
-        self._discs = EllipseCollection(size, size, offsets=offsets, edgecolors=EDGE, linewidths=0.8, gid="body", **look)
-        axes.add_collection(self._discs, autolim=False)
+        somewhere = np.zeros((len(found.radius), 2))
+        self._discs = discs(axes, somewhere, found.radius, edgecolors=EDGE, linewidths=0.8, zorder=4.5, gid="body")
         self._strokes = Line2D([], [], color=EDGE, linewidth=1.4, solid_capstyle="butt", zorder=4.6, gid="heading")
         axes.add_artist(self._strokes)
         if shades is not None:

@@ -1,20 +1,45 @@
-"""Colours that colour-blind readers can tell apart: for lines, for regions, and a colour scale for margins."""
+"""Colours, markers and line styles that colour-blind readers can tell apart, and a colour scale for margins."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Colours of Okabe and Ito, which colour-blind readers can tell apart. Their yellow is left out: it is hard to see on white."""
+MARKERS = ("o", "s", "^", "D", "v", "<", ">")
+STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
+GREY = "0.45"
+FEW: Final = 12
+"""Most agents that have colours of their own. The pages' script has the same number."""
 LINK: Final = "#4d5663"
 """Colour of links: dark. They differ from paths in lightness, so that every reader can tell them apart."""
 TRAIL: Final = "#dccaa4"
 """Colour of the paths of many agents: light."""
 AREA: Final = (0.0, 0.447, 0.698)
+SHARED: Final = "0.3"
+"""Colour of regions that several agents share."""
 CLASSES: Final = 4
 """Number of margin classes on each side of zero. Each class holds about the same number of agents."""
+
+
+def colour(agent: int) -> str:
+    """Colour of an agent (index in the team), the same in every figure."""
+    return COLOURS[agent % len(COLOURS)]
+
+
+def marker(agent: int) -> str:
+    """Marker of an agent (index in the team). Agents with the same colour have different markers."""
+    return MARKERS[(agent + agent // len(COLOURS)) % len(MARKERS)]
+
+
+def colour_of(owners: Sequence[int]) -> str:
+    """Colour of a region: that of its owner; `SHARED` for several owners."""
+    return colour(owners[0]) if len(owners) == 1 else SHARED
 
 
 def classes(margins: np.ndarray) -> tuple[Colormap, BoundaryNorm, np.ndarray, Literal["neither", "min", "max"]]:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.collections import EllipseCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 
+from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.views import areas, space
-from consat.views.areas import SHARED
-from consat.views.colours import AREA, LINK, TRAIL
-from consat.views.figures import regions
+from consat.views.colours import AREA, LINK, SHARED, TRAIL
+from consat.views.regions import contours, regions
 from consat.views.shapes import Shapes
 
 MOST_LINES: Final = 2000
@@ -44,6 +43,11 @@ class View(NamedTuple):
     along: np.ndarray
     points: np.ndarray
 
+    def psi(self, team: Team, x: np.ndarray, families: Sequence[Family] | None = None) -> np.ndarray:
+        """(M, K, K) every ψ on the grid, rows upwards, with all other agents at x (N, d); see `regions`."""
+        count = self.along.shape[1]
+        return regions(team, x, self.points, families).reshape(-1, count, count).swapaxes(1, 2)
+
 
 def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> list[Artist]:
     """Draw the regions of a crowd in the plane, except those that move with agents. Returns the new artists.
@@ -58,31 +62,27 @@ def lawn(axes: Any, team: Team, found: Shapes, x: np.ndarray, view: View) -> lis
     before = set(axes.get_children())
     center, fixed = found.balls.at(x)[:, :2], found.balls.around < 0
     goals, bars = (np.flatnonzero(fixed & (found.balls.keeps_out == out)) for out in (False, True))
-    look: dict[str, Any] = {"units": "xy", "offset_transform": axes.transData, "angles": 0.0}
+    radius = found.balls.radius
     if len(goals):
-        discs = [Path.circle(center[k], found.balls.radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
-        union = PathPatch(Path.make_compound_path(*discs), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
+        circles = [Path.circle(center[k], radius[k]) for k in goals]  # same orientation, so that overlaps are tinted once
+        union = PathPatch(Path.make_compound_path(*circles), facecolor=(*AREA, 0.1), edgecolor="none", zorder=0.6, gid="region")
         axes.add_artist(union)
     if 0 < len(goals) <= MOST_TINTED:
-        size = 2 * found.balls.radius[goals]
         ring: dict[str, Any] = {"facecolors": "none", "edgecolors": [(*AREA, 0.55)], "linewidths": 0.7, "gid": "boundary"}
-        axes.add_collection(EllipseCollection(size, size, offsets=center[goals], zorder=0.7, **ring, **look))
+        areas.discs(axes, center[goals], radius[goals], zorder=0.7, **ring)
     if len(bars) > MOST_HATCHED:
-        size = 2 * found.balls.radius[bars]
         dark: dict[str, Any] = {"facecolors": [(0.3, 0.3, 0.3, 0.35)], "edgecolors": [(0.3, 0.3, 0.3, 0.8)], "linewidths": 0.6}
-        axes.add_collection(EllipseCollection(size, size, offsets=center[bars], zorder=0.8, gid="keep-out", **dark, **look))
+        areas.discs(axes, center[bars], radius[bars], zorder=0.8, gid="keep-out", **dark)
     for k in bars if len(bars) <= MOST_HATCHED else ():
-        areas.hatched(axes, SHARED).set_path(Path.circle(center[k], found.balls.radius[k]))
-        axes.add_artist(Circle(center[k], found.balls.radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
+        areas.hatched(axes, SHARED).set_path(Path.circle(center[k], radius[k]))
+        axes.add_artist(Circle(center[k], radius[k], fill=False, edgecolor=SHARED, zorder=2, gid="boundary"))
     for normal, offset in list(zip(found.walls.normal, found.walls.offset, strict=True))[:MOST_WALLS]:
         areas.wall(axes, view.low, view.high, normal, offset, SHARED)
     others = [family for family in team.families if family.arity == 1 and np.isin(family.number, found.others).any()]
     if 0 < sum(family.size for family in others) <= MOST_OTHERS:
-        fine = view.along.shape[1]
-        values = regions(team, x, view.points, others).reshape(-1, fine, fine).swapaxes(1, 2)
-        across, up = view.along
+        values, (across, up) = view.psi(team, x, others), view.along
         for number in sorted(int(number) for family in others for number in family.number):
-            for line in areas.contours(across, up, values[number]):
+            for line in contours(across, up, values[number]):
                 axes.add_artist(Line2D(*line.T, color=AREA, linewidth=1.0, zorder=2, gid="boundary"))
     return [artist for artist in axes.get_children() if artist not in before]
 

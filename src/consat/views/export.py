@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,7 @@ def _csv(result: Result, target: Path, progress: Progress | None) -> None:
     """One row per agent and recorded time or round: the time in s if rounds have a duration, position, and margin, empty if infinite."""
     import xarray as xr
 
-    from consat.views.figures import period, seconds
+    from consat.views.record import period, seconds
 
     data = result.data
     clock = str(data["position"].dims[0])
@@ -44,6 +45,8 @@ def _film(result: Result, target: Path, progress: Progress | None) -> None:
 
 
 def _mcap(result: Result, target: Path, progress: Progress | None) -> None:
+    if find_spec("foxglove") is None:
+        raise InvalidSettings("an MCAP file needs foxglove-sdk; install it with: pip install 'consat[mcap]'")
     from consat.views import mcap
 
     mcap.save(result, target)

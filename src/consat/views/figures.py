@@ -1,43 +1,31 @@
-"""Figures of a run, as in the paper: formation, margins, estimates, integral states.
-
-Regions are drawn in the same way for every ψ (library kind, expression or own function): ψ is evaluated with its owner at the points of a
-grid and all other agents at their positions. The line ψ = 0 is the boundary of the region in which the constraint holds for its owner.
-"""
+"""Figures of a run, as in the paper: formation, margins, estimates, integral states."""
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import matplotlib as mpl
 import numpy as np
-from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from consat.numerics import float64
-from consat.problem.family import Family
-from consat.problem.team import Team
 from consat.results.result import Result
-from consat.views.words import typeset
+from consat.views.colours import COLOURS, GREY, STYLES, colour
+from consat.views.record import evenly, period, recorded, seconds
+from consat.views.scene import Scene
+from consat.views.words import label, plain, typeset
 
 if TYPE_CHECKING:
     import xarray as xr
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Colours of Okabe and Ito, which colour-blind readers can tell apart. Their yellow is left out: it is hard to see on white."""
-MARKERS = ("o", "s", "^", "D", "v", "<", ">")
-STYLES: Sequence[Any] = ("-", (0, (5, 2.5)), (0, (1, 2)), (0, (6, 2, 1, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (10, 4)))
-GREY = "0.45"
 VERDICTS: Mapping[str, Mapping[str, Any]] = {
     "feasible": {"facecolor": "#009E73", "edgecolor": "#009E73"},
     "infeasible": {"facecolor": "#D55E00", "edgecolor": "white", "hatch": "xxx"},
@@ -45,123 +33,9 @@ VERDICTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Style of each verdict over time. The hatches differ as well as the colours."""
 DPI = 150
-BATCH = 8192
-FAR = 6.0
-"""Paths are cut where they would make the view more than this factor wider, so that the formation stays visible."""
-MOST_NUMBERS = 10_000_000
-"""Most numbers of a record that are drawn. A larger record is thinned to evenly spaced steps."""
 MOST_CURVES, MOST_ENTRIES, MOST_DOTS = 120, 12, 60
 MOST_HELD = 12
 """Most agents for which every copy is drawn as a curve. With more agents, or more than `MOST_CURVES` curves, quantile bands are drawn."""
-
-
-def colour(agent: int) -> str:
-    """Colour of an agent (index in the team), the same in every figure."""
-    return COLOURS[agent % len(COLOURS)]
-
-
-def marker(agent: int) -> str:
-    """Marker of an agent (index in the team). Agents with the same colour have different markers."""
-    return MARKERS[(agent + agent // len(COLOURS)) % len(MARKERS)]
-
-
-def plain(text: str, longest: int = 34) -> str:
-    """A name as text for matplotlib: shortened to `longest` characters, with dollar signs escaped, which else begin a formula."""
-    return (text if len(text) <= longest else text[: longest - 1] + "…").replace("$", r"\$")
-
-
-@functools.partial(jax.jit, static_argnames="psi")
-def _over(psi: Callable[..., Any], points: Any, arguments: Any, slot: Any, parameters: Mapping[str, Any], weight: Any) -> Array:
-    def at(point: Array, arguments: Array, slot: Array, parameters: Mapping[str, Array], weight: Array) -> Array:
-        return weight * psi(*arguments.at[slot, : len(point)].set(point), **parameters)
-
-    return jax.vmap(jax.vmap(at, (0, None, None, None, None)), (None, 0, 0, 0, 0))(points, arguments, slot, parameters, weight)
-
-
-@float64
-def regions(team: Team, x: np.ndarray, points: np.ndarray, families: Sequence[Family] | None = None) -> np.ndarray:
-    """Evaluate each ψ with its owner moved to other points and all other agents at their positions.
-
-    Args:
-        team: the team.
-        x: (N, d) positions of all agents.
-        points: (K, p) points for the owner. They replace its first p ≤ d coordinates.
-        families: families of the constraints to evaluate; None for all.
-
-    Returns:
-        (M, K) weighted ψ of every constraint, in the team's order; NaN where it is not finite, and for constraints not in `families`.
-    """
-    count = len(points)
-    batches = np.resize(points, (-(-count // BATCH), BATCH, points.shape[1]))  # batches of equal size, so that ψ is compiled once
-    values = np.full((len(team.owner), batches.shape[0] * BATCH), np.nan)
-    for family in team.families if families is None else families:
-        slot = np.argmax(family.agents == family.owner[:, None], axis=1)
-        parameters = {key: np.asarray(value) for key, value in family.parameters.items()}
-        arguments, weight = np.asarray(x[family.agents], dtype=float), np.asarray(family.weight, dtype=float)
-        for k, batch in enumerate(batches):
-            at = slice(k * BATCH, (k + 1) * BATCH)
-            values[family.number, at] = _over(family.psi, batch, arguments, slot, parameters, weight)
-    return np.where(np.isfinite(values), values, np.nan)[:, :count]
-
-
-def grid(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Grid in a box with corners `low` and `high`, (p,): (p, count) coordinates along each axis, and (count^p, p) grid points."""
-    along = np.linspace(low, high, count, axis=-1)
-    return along, np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(low))
-
-
-def _sights(team: Team, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Index and bounding box, (2, p), of every region ψ > 0, or forbidden region ψ < 0, that lies inside the given box."""
-    count = {1: 401, 2: 81, 3: 31}[len(low)]
-    along, points = grid(low, high, count)
-    for k, values in enumerate(regions(team, x, points).reshape(-1, *(count,) * len(low))):
-        for places in (np.argwhere(values > 0), np.argwhere(values < 0)):
-            if len(places) and places.min() > 0 and places.max() < count - 1:
-                ends = np.stack([places.min(axis=0) - 1, places.max(axis=0) + 1])
-                yield k, np.take_along_axis(along, ends.T, axis=1).T
-
-
-def view(paths: np.ndarray, x: np.ndarray, team: Team | None, boxes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, bool]:
-    """The box to show. It holds the final formation, the regions, and the paths if they don't start far away (`FAR`).
-
-    Args:
-        paths: (T, N, p) positions over time, on the axes shown; the last is the final formation.
-        x: (N, d) final positions on all axes.
-        team: team whose regions are found by sampling; None if `boxes` already holds them.
-        boxes: (B, 2, p) further boxes that the view should hold, low and high corner.
-
-    Returns:
-        low and high corner of the view, (p,) each, and whether it cuts off the beginning of paths.
-    """
-    everywhere, core = paths[np.isfinite(paths).all(axis=2)], paths[-1]  # an agent that joined later has no position before
-    middle = (core.min(axis=0) + core.max(axis=0)) / 2
-    half = max(float(np.ptp(core, axis=0).max()), 1e-3 * float(np.ptp(everywhere, axis=0).max())) or 1e-3
-    count = 0 if team is None else len(team.owner)
-    missing = set(range(count))
-    for factor in 4.0 ** np.arange(12):  # widen the search until every region was found
-        for k, box in _sights(team, x, middle - factor * half, middle + factor * half) if team is not None and missing else ():
-            if k in missing and (len(missing) == count or np.ptp(box, axis=0).max() <= FAR * np.ptp(core, axis=0).max()):
-                core = np.concatenate([core, box])
-                missing.discard(k)
-    for box in () if boxes is None else boxes:
-        if np.ptp(np.concatenate([core, box]), axis=0).max() <= FAR * max(np.ptp(paths[-1], axis=0).max(), np.ptp(box, axis=0).max()):
-            core = np.concatenate([core, box])
-    both = np.concatenate([core, everywhere])
-    cut = bool(np.ptp(both, axis=0).max() > FAR * np.ptp(core, axis=0).max() > 0)
-    low, high = (core if cut else both).min(axis=0), (core if cut else both).max(axis=0)
-    side = float((high - low).max()) or 1.0
-    least = 0.75 if len(low) < 3 else 0.5  # the least length of the other sides, relative to the longest side
-    spare = np.maximum(0.0, least * side - (high - low)) / 2 + (0.35 if cut else 0.08) * side
-    return low - spare, high + spare, cut
-
-
-def recorded(result: Result) -> xr.Dataset:
-    """The record of a run. A very long record is thinned to evenly spaced steps, first and last included."""
-    data = result.data
-    clock = str(data["margin"].dims[0])
-    count, row = data.sizes[clock], sum(math.prod(data[name].shape[1:]) for name in data.data_vars if clock in data[name].dims)
-    most = max(2, MOST_NUMBERS // max(row, 1))
-    return data if count <= most else data.isel({clock: _sample(count, most)})
 
 
 def formation(result: Result, axes: Any = None) -> Figure | None:
@@ -176,9 +50,7 @@ def formation(result: Result, axes: Any = None) -> Figure | None:
     """
     if "position" not in result.data:
         return None
-    from consat.views.scene import Scene  # the figure is the last moment of the film
-
-    scene = Scene(result, axes)
+    scene = Scene(result, axes)  # the figure is the last moment of the film
     scene.show(scene.last)
     figure: Figure = scene.figure
     return figure
@@ -196,10 +68,10 @@ def margins(result: Result) -> Figure:
     axes.axhline(0.0, color="black", linewidth=0.8)
     proves = "bound" in data and np.isfinite(data["bound"].values).any()
     curves = [("margin", r"margin $\barβ$", 0), *([] if proves else [("smooth_margin", r"smooth margin $β$", 1)])]
-    for name, label, k in curves:
+    for name, text, k in curves:
         curve = data[name].where(np.isfinite(data[name]))
         dots = "." if clock == "round" and len(curve) <= MOST_DOTS else ""
-        axes.plot(along, curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=label)
+        axes.plot(along, curve, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.8, marker=dots, label=text)
     if proves:
         bound = data["bound"].where(np.isfinite(data["bound"]))
         axes.plot(along, bound, color=COLOURS[1], linestyle=(0, (1, 1)), linewidth=2.2, label="bound that all agents have proven")
@@ -213,9 +85,9 @@ def margins(result: Result) -> Figure:
     since = summary["satisfied_from"]["time" if clock == "time" else "round"]
     if since is not None:
         axes.axvline(since, color=COLOURS[3], linewidth=1.5, linestyle=":")
-        label = f"satisfied from t = {typeset(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
+        text = f"satisfied from t = {typeset(since)} s" if clock == "time" else f"satisfied from round {since:.0f}"
         late = since > np.mean(axes.get_xlim())
-        axes.text(since, 0.06, f" {label} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
+        axes.text(since, 0.06, f" {text} ", ha="right" if late else "left", transform=axes.get_xaxis_transform())
     entries = [*axes.get_legend_handles_labels()[0], *(_band(axes, verdicts) if verdicts else ())]
     figure.legend(handles=entries, loc="outside lower center", ncols=2, frameon=False)
     return figure
@@ -269,24 +141,6 @@ def _stretch(axes: Axes, *curves: np.ndarray) -> None:
     axes.set_ylim(limits)
 
 
-def seconds(result: Result, steps: np.ndarray) -> np.ndarray:
-    """Times, s, of recorded steps. If rounds have no duration, the round numbers."""
-    return steps * (period(result) or 1.0)
-
-
-def period(result: Result) -> float | None:
-    """Duration of one unit of the record's clock, s; None if rounds have no known duration."""
-    clock = str(result.data["margin"].dims[0])
-    last, motion, verdicts = float(result.data[clock].values[-1]), result.summary.get("motion"), result.summary.get("verdicts")
-    duration = motion["duration"] if motion else verdicts[-1]["to"] if verdicts else None
-    return 1.0 if clock == "time" else None if duration is None or not last > 0 else float(duration) / last
-
-
-def label(what: str, unit: str | None) -> str:
-    """Label of an axis: the quantity, and the unit if there is one."""
-    return what if unit is None else f"{what} [{plain(unit)}]"
-
-
 def estimates(result: Result) -> Figure | None:
     """Figure of the agents' estimates of positions: one colour per coordinate, one line style per holder.
 
@@ -320,7 +174,7 @@ def _copies(result: Result, name: str, title: str, ylabel: str) -> Figure | None
             axes.plot(data[clock], values, color=shade, linestyle=STYLES[holder % len(STYLES)], linewidth=1.3)
     entries = [
         Line2D([], [], color=shades[i, k], linewidth=2.5, label=f"{names[k]} of {plain(ids[i], 14)}")
-        for i, k in (divmod(place, dimension) for place in _sample(len(ids) * dimension, MOST_ENTRIES))
+        for i, k in (divmod(place, dimension) for place in evenly(len(ids) * dimension, MOST_ENTRIES))
     ]
     for agent, style in zip(ids, STYLES, strict=False):
         entries.append(Line2D([], [], color=GREY, linestyle=style, label=f"held by {plain(agent, 14)}"))
@@ -356,11 +210,6 @@ def _spread(result: Result, data: xr.Dataset, name: str, title: str) -> Figure:
     axes.set_ylim(bottom=0.0)
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
-
-
-def _sample(count: int, most: int) -> list[int]:
-    """At most `most` evenly spaced indices out of `count`."""
-    return [int(place) for place in np.linspace(0, count - 1, min(count, most))]
 
 
 def _shades(agents: int, dimension: int) -> np.ndarray:

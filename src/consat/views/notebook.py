@@ -126,7 +126,6 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     from matplotlib.patches import Circle
 
     from consat.views import areas, colours
-    from consat.views.figures import colour, label, marker, plain
     from consat.views.shapes import shapes
 
     if found.count > MOST_DRAWN or found.dimension != 2:
@@ -140,15 +139,15 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     if known:
-        axes.set(xlabel=label("position x", found.unit), ylabel=label("position y", found.unit))
+        axes.set(xlabel=words.label("position x", found.unit), ylabel=words.label("position y", found.unit))
         axes.grid(color="0.92", linewidth=0.8)
         centers = balls.at(places)
         for k in np.flatnonzero(balls.around < 0):
             owners, radius = balls.owners[k], balls.radius[k]
-            shade = areas.colour_of(owners) if found.count <= MOST_ROWS else colours.AREA
-            style = areas.keep_out_style(areas.SHARED) if balls.keeps_out[k] else {"facecolor": shade, "alpha": 0.15}
+            shade = colours.colour_of(owners) if found.count <= MOST_ROWS else colours.AREA
+            style = areas.keep_out_style(colours.SHARED) if balls.keeps_out[k] else {"facecolor": shade, "alpha": 0.15}
             axes.add_patch(Circle(tuple(centers[k]), radius, **style))
-            axes.add_patch(Circle(tuple(centers[k]), radius, fill=False, edgecolor=areas.SHARED if balls.keeps_out[k] else shade))
+            axes.add_patch(Circle(tuple(centers[k]), radius, fill=False, edgecolor=colours.SHARED if balls.keeps_out[k] else shade))
     else:
         angle = 2 * np.pi * np.arange(found.count) / found.count + np.pi / 2
         places = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -156,10 +155,10 @@ def sketch(found: Team, x: np.ndarray | None = None) -> Figure | None:
     axes.plot(*np.insert(places[found.links], 2, np.nan, axis=1).reshape(-1, 2).T, color=colours.LINK, linewidth=0.9, zorder=2)
     few = found.count <= MOST_ROWS
     for i in range(found.count):
-        shade, shape = (colour(i), marker(i)) if few else (colours.AREA, "o")
+        shade, shape = (colours.colour(i), colours.marker(i)) if few else (colours.AREA, "o")
         axes.plot(*places[i], shape, color=shade, markeredgecolor="white", markersize=8 if few else 4, zorder=3)
         if few:
-            name = plain(str(found.ids[i]), 14)
+            name = words.plain(str(found.ids[i]), 14)
             axes.annotate(name, places[i], (6, 6), textcoords="offset points", color=shade, weight="bold", zorder=4)
     axes.margins(0.12)
     return figure
@@ -188,7 +187,7 @@ def solution(answer: Mapping[str, Any], found: Team | None) -> str:
 
 def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """HTML of a sweep: one row for each combination of values, and the figure."""
-    from consat.views import spread
+    from consat.views import sweeps
 
     groups = summary["groups"]
     flows = groups[0]["messages"] is None
@@ -204,5 +203,5 @@ def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     note = "<p>median over the seeds (from the 10th to the 90th percentile)</p>"
     title = f"{counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"
     good = all(group["success"] == 1 for group in groups)
-    picture = _image(spread.draw(summary, runs), f"sweep of {summary['scenario']}")
+    picture = _image(sweeps.draw(summary, runs), f"sweep of {summary['scenario']}")
     return _headline(summary["scenario"], title, good) + _table(head, rows, len(groups) - len(rows)) + note + picture

@@ -6,12 +6,18 @@ A moment is a sample index; a fractional one is interpolated between two samples
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from consat.results.result import Result
-from consat.views.figures import period, recorded, seconds
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+MOST_NUMBERS = 10_000_000
+"""Most numbers of a record that are drawn. A larger record is thinned to evenly spaced steps."""
 
 
 class Record:
@@ -22,6 +28,8 @@ class Record:
 
     Attributes:
         data: the recorded steps, as in the result.
+        team: the team; None if it is unknown, or if not all agents are recorded, whose positions regions need.
+        ids: ids of the recorded agents.
         x: (T, N, d) positions.
         times: (T,) times, s; round numbers if rounds have no duration.
         steps: (T,) what is shown: times, s, or round numbers if rounds have no duration.
@@ -33,6 +41,8 @@ class Record:
 
     def __init__(self, result: Result) -> None:
         self.data = recorded(result)
+        self.team = None if "final_position" in self.data else result.team
+        self.ids = [str(name) for name in self.data["agent"].values]
         self.x, self.clock = self.data["position"].values, str(self.data["position"].dims[0])
         self.steps, self.margin, self.agent_margin = (self.data[name].values for name in (self.clock, "margin", "agent_margin"))
         finite = np.flatnonzero(np.isfinite(self.x).all(axis=(1, 2)))
@@ -85,3 +95,30 @@ def between(series: np.ndarray, moment: Any) -> np.ndarray:
     moment = np.atleast_1d(moment)
     share = (moment % 1).reshape(-1, *(1,) * (series.ndim - 1))
     return (1 - share) * series[moment.astype(int)] + share * series[np.ceil(moment).astype(int)]
+
+
+def recorded(result: Result) -> xr.Dataset:
+    """The record of a run. A very long record is thinned to evenly spaced steps, first and last included."""
+    data = result.data
+    clock = str(data["margin"].dims[0])
+    count, row = data.sizes[clock], sum(math.prod(data[name].shape[1:]) for name in data.data_vars if clock in data[name].dims)
+    most = max(2, MOST_NUMBERS // max(row, 1))
+    return data if count <= most else data.isel({clock: evenly(count, most)})
+
+
+def seconds(result: Result, steps: np.ndarray) -> np.ndarray:
+    """Times, s, of recorded steps. If rounds have no duration, the round numbers."""
+    return steps * (period(result) or 1.0)
+
+
+def period(result: Result) -> float | None:
+    """Duration of one unit of the record's clock, s; None if rounds have no known duration."""
+    clock = str(result.data["margin"].dims[0])
+    last, motion, verdicts = float(result.data[clock].values[-1]), result.summary.get("motion"), result.summary.get("verdicts")
+    duration = motion["duration"] if motion else verdicts[-1]["to"] if verdicts else None
+    return 1.0 if clock == "time" else None if duration is None or not last > 0 else float(duration) / last
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """At most `most` evenly spaced indices out of `count`."""
+    return [int(place) for place in np.linspace(0, count - 1, min(count, most))]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -21,13 +22,12 @@ from consat.errors import InvalidSettings, counted
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.scenario.robots import obstacle_data
-from consat.views import bodies, picture, words
-from consat.views.colours import classes
-from consat.views.outlines import MOST, outlines
+from consat.views import bodies, page_data, words
+from consat.views.colours import FEW, classes
 from consat.views.page import page as assembled
-from consat.views.picture import FEW, MOST_SHAPES
 from consat.views.record import Record, spread
-from consat.views.shapes import Shapes, moves, shapes
+from consat.views.regions import MOST_TRACED, outlines
+from consat.views.shapes import MOST_SHAPES, Shapes, moves, shapes
 
 SCHEMA: Final = "consat.replay/1"
 MOST_NUMBERS: Final = 2_000_000
@@ -135,26 +135,27 @@ def document(result: Result) -> dict[str, Any]:
     ``walls`` and ``outlines`` are the regions; ``obstacles`` as in a scenario; ``bodies`` of robots. ``spread`` are moments, sample indices
     spread by movement and time.
     """
-    record, summary, team = Record(result), result.summary, None if "final_position" in result.data else result.team
-    data, chosen = record.data, _steps(record.x[: record.last + 1, :, :3])
+    record, summary = Record(result), result.summary
+    data, team, seen = record.data, record.team, record.x[: record.last + 1, :, :3]
+    most = max(2, MOST_NUMBERS // max(1, math.prod(seen.shape[1:])))
+    chosen = np.arange(len(seen)) if len(seen) <= most else _samples(seen, most)
     x, times, steps = record.x[chosen, :, :3], record.times[chosen], record.steps[chosen]
     dimension = x.shape[2]
-    stand = bodies.obstacles(result)
+    robots, stand = bodies.robots(result, data)
     low, high, found = _regions(team, x, times, bodies.bounds(stand, dimension) if dimension > 1 else None)
     shades, edges = _palette(result)
     bound = data["bound"].values[chosen] if "bound" in data and np.isfinite(data["bound"].values).any() else None
-    since = summary["satisfied_from"]["time" if record.clock == "time" else "round"]
     return {
         "schema": SCHEMA,
         "name": summary["scenario"],
         "unit": None if team is None else team.unit,
         "clock": record.clock,
         "dimension": dimension,
-        "ids": [str(name) for name in data["agent"].values],
+        "ids": record.ids,
         "verdict": summary["verdict"],
         "bounds": None if summary.get("verdicts") else summary.get("bounds"),
         "verdicts": [[each["from"], each["to"], each["verdict"]] for each in summary.get("verdicts") or ()],
-        "since": since,
+        "since": summary["satisfied_from"]["time" if record.clock == "time" else "round"],
         "steps": _packed(steps),
         "x": _packed(np.nan_to_num(x)),
         "margin": _packed(record.margin[chosen]),
@@ -165,56 +166,42 @@ def document(result: Result) -> dict[str, Any]:
         "high": [round(float(value), 6) for value in high],
         "spread": [round(float(value), 3) for value in spread(x, steps, SPREAD, MOVEMENT)],
         "scale": {"edges": edges, "shades": shades},
-        "bodies": _bodies(result, data, chosen),
+        "bodies": None if robots is None else _bodies(robots, chosen),
         "obstacles": [obstacle_data(each) for each in stand],
         **found,
     }
 
 
-def _bodies(result: Result, data: Any, chosen: np.ndarray) -> dict[str, Any] | None:
-    """Sizes of bodies, and headings, (T, N), if there are any; None without robots."""
-    found = bodies.bodies(result, data)
-    if found is None:
-        return None
-    turns = found.heading is not None and bool(found.turns.any())
-    heading = _packed(np.nan_to_num(found.heading[chosen])) if found.heading is not None and turns else None
+def _bodies(found: bodies.Bodies, chosen: np.ndarray) -> dict[str, Any]:
+    """Sizes of bodies, and headings, (T, N), if there are any."""
+    heading = None if found.heading is None or not found.turns.any() else _packed(np.nan_to_num(found.heading[chosen]))
     return {"radius": found.radius.tolist(), "offset": found.offset.tolist(), "heading": heading}
 
 
-def _steps(x: np.ndarray) -> np.ndarray:
-    """Indices of the steps that are replayed."""
-    most = max(2, MOST_NUMBERS // max(1, x.shape[1] * x.shape[2]))
-    if len(x) <= most:
-        return np.arange(len(x))
-    return np.unique(np.round(spread(x, np.arange(len(x)), most, MOVEMENT)).astype(int))
+def _samples(x: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` samples of x, (T, N, d), spread by movement and time."""
+    return np.unique(np.round(spread(x, np.arange(len(x)), count, MOVEMENT)).astype(int))
 
 
 def _regions(
     team: Team | None, x: np.ndarray, times: np.ndarray, stand: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, list[Mapping[str, Any]]]]:
     """The box to show, lower and upper corner, and the regions. stand: (B, 2, d) boxes around obstacles."""
-    low, high = picture.frame(team, x, times, stand)
+    low, high = page_data.frame(team, x, times, stand)
     if team is None or len(team.owner) > MOST_SHAPES:
         return low, high, {"balls": [], "walls": [], "outlines": []}
     found = shapes(team, times[-1])
-    balls, walls = picture.constraints_of(team, found)
-    moments = _moments(x) if team.moves else np.zeros(0, dtype=int)
+    moments = _samples(x, MOST_OUTLINED) if team.moves else np.zeros(0, dtype=int)
     seen = [shapes(team, times[moment]) for moment in moments]
-    ties = moves(team)
     told: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
             {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
-            for k, ball in enumerate(picture.balls_of(team, found, balls))
+            for k, ball in enumerate(page_data.balls_of(team, found.balls))
         ],
-        "walls": _walls(team, [*seen, found], walls, ties[found.walls.number], moments, (low, high)),
+        "walls": _walls(team, [*seen, found], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
     return low, high, told
-
-
-def _moments(x: np.ndarray) -> np.ndarray:
-    """Samples at which moving regions are written."""
-    return np.unique(np.round(spread(x, np.arange(len(x)), MOST_OUTLINED, MOVEMENT)).astype(int))
 
 
 def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:
@@ -226,24 +213,21 @@ def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[
     }
 
 
-def _walls(
-    team: Team, seen: Sequence[Shapes], members: list[list[int]], ties: np.ndarray, moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]
-) -> list[Mapping[str, Any]]:
+def _walls(team: Team, seen: Sequence[Shapes], moments: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> list[Mapping[str, Any]]:
     """The half-spaces, those that move with their corners and normals at some samples; without corners where they are out of view.
 
     Args:
         team: the team.
         seen: its geometry at the samples, and, as the last, at the end.
-        members: from `picture.constraints_of`.
-        ties: (K,) whether each half-space moves.
         moments: the samples.
         box: lower and upper corner of the view.
     """
-    *before, last = ({wall["place"]: wall for wall in picture.walls_of(team, each.walls, members, *box)} for each in seen)
+    *before, last = ({wall["place"]: wall for wall in page_data.walls_of(team, each.walls, *box)} for each in seen)
     found: list[Mapping[str, Any]] = []
-    for k, moving in enumerate(ties.tolist()):
+    ties = moves(team)
+    for k, numbers in enumerate(seen[-1].walls.numbers):
         known = [each[k] for each in (*before, last) if k in each]
-        if not known or not (moving and before):
+        if not known or not (before and ties[numbers[0]]):
             found += known[-1:]
             continue
         normals = [np.round(each.walls.normal[k], 6).tolist() for each in seen[:-1]]
@@ -256,10 +240,10 @@ def _outlines(
     team: Team, numbers: np.ndarray, x: np.ndarray, times: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[Mapping[str, Any]]:
     """Boundaries of other ψ in the plane; of those that move, at some samples."""
-    if team.dimension != 2 or not 0 < len(numbers) <= MOST:
+    if team.dimension != 2 or not 0 < len(numbers) <= MOST_TRACED:
         return []
     moving = moves(team)[numbers]
-    moments = _moments(x) if moving.any() else np.array([len(x) - 1])
+    moments = _samples(x, MOST_OUTLINED) if moving.any() else np.array([len(x) - 1])
     traced = [outlines(team.at(times[moment]), numbers.tolist(), x[moment], low, high) for moment in moments]
     digits = max(0, 4 - int(np.floor(np.log10(float((high - low).max()) or 1.0))))
     found: list[Mapping[str, Any]] = []

@@ -1,6 +1,6 @@
 """Drawing of the formation at any recorded moment: paths, constraint regions, links and labels on one set of axes.
 
-A small team has at most `MOST_AGENTS` agents and `MOST_CONSTRAINTS` constraints: each agent has its colour, marker and name. A larger team
+A small team has at most `FEW` agents and `MOST_CONSTRAINTS` constraints: each agent has its colour, marker and name. A larger team
 is drawn as a crowd: agents are dots coloured by margin.
 """
 
@@ -20,17 +20,15 @@ from matplotlib.patheffects import withStroke
 from consat.problem.team import Team
 from consat.results.result import Result
 from consat.views import areas, bodies, crowd, space
-from consat.views.areas import SHARED, Area, Ground
-from consat.views.colours import AREA, LINK, TRAIL, classes
+from consat.views.areas import Area, Ground
+from consat.views.colours import AREA, FEW, GREY, LINK, SHARED, TRAIL, classes, colour, marker
 from consat.views.crowd import MOST_LINES, View
-from consat.views.figures import GREY, colour, grid, label, marker, plain, regions, view
 from consat.views.record import Record, between
-from consat.views.shapes import Shapes, boxes, moves, shapes, ways
-from consat.views.words import typeset
+from consat.views.regions import grid, regions, view
+from consat.views.shapes import MOST_SHAPES, Shapes, boxes, moves, shapes, ways
+from consat.views.words import label, plain, typeset
 
-MOST_AGENTS, MOST_CONSTRAINTS, MOST_ENTRIES = 12, 40, 16
-MOST_SHAPES = 20_000
-"""Most constraints of a team whose regions are drawn."""
+MOST_CONSTRAINTS, MOST_ENTRIES = 40, 16
 GRID = 241
 """Grid points per axis of the view at which ψ is evaluated."""
 DOTS: Any = (0, (1, 1.5))
@@ -80,10 +78,10 @@ class Scene:
 
     def __init__(self, result: Result, axes: Any = None, fine: int = GRID) -> None:
         self.record = record = Record(result)
-        data, team = record.data, None if "final_position" in result.data else result.team  # regions need the positions of all agents
+        data, team = record.data, record.team
         self.x, self.steps, self.last = record.x, record.steps, record.last
-        self._few = self.x.shape[1] <= MOST_AGENTS and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
-        self._name, self._ids = plain(result.summary["scenario"]), [plain(str(name), 14) for name in data["agent"].values]
+        self._few = self.x.shape[1] <= FEW and (team is None or len(team.owner) <= MOST_CONSTRAINTS)
+        self._name, self._ids = plain(result.summary["scenario"]), [plain(name, 14) for name in record.ids]
         self._sample = [f"{self.x.shape[1]} of {result.summary['count']:,} agents"] if "final_position" in result.data else []
         self._fine, self._team = fine, team if team is not None and 0 < len(team.owner) <= MOST_SHAPES else None
         self._links = team.links if team is not None and len(team.links) <= MOST_LINES else np.zeros((0, 2), dtype=int)
@@ -98,7 +96,7 @@ class Scene:
         self._lawn: list[Artist] = []
         seen = self.x.shape[2] in (2, 3)
         self._crew: bodies.Crew | None = None
-        self._robots, self._map = (bodies.bodies(result, data), bodies.obstacles(result)) if seen else (None, ())
+        self._robots, self._map = bodies.robots(result, data) if seen else (None, ())
         if self._team is not None and (self._space or not self._few):
             self._shapes = shapes(self._team, self.record.times[self.last])
         ratio = self._frame([str(name) for name in data["axis"].values], None if team is None else team.unit)
@@ -143,16 +141,14 @@ class Scene:
         self._where = _directions(points[: len(self._ids)], list(map(len, self._ids))) if self._few else []
         return 1.25 if self._line or self._space else float((high - low)[0] / (high - low)[1])
 
-    def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray | None:
-        """(B, 2, p) boxes that the view must hold besides the regions that `view` finds; None if there are none."""
+    def _boxes(self, x: np.ndarray, axes: int) -> np.ndarray:
+        """(B, 2, p) boxes that the view must hold besides the regions that `view` finds."""
         if self._team is None:
             return self._near(axes)
         found = [self._near(axes), boxes(self._team)[:, :, :axes], ways(self._team, self.record.times[: self.last + 1])[:, :, :axes]]
         if not self._few and self._shapes is not None and not self._line:
             balls = self._shapes.balls
-            fixed = balls.around < 0
-            center, radius = balls.at(x)[fixed, None, :axes], balls.radius[fixed, None, None]
-            found.append(np.concatenate([center - radius, center + radius], axis=1))
+            found.append(balls.boxes(x)[balls.around < 0, :, :axes])
         return np.concatenate(found)
 
     def _near(self, axes: int) -> np.ndarray:
@@ -171,12 +167,9 @@ class Scene:
             values = np.stack([regions(team.at(time), at, self._view.points) for time, at in columns], axis=2)
             self._areas, self._tube = areas.areas(team, values), values
         elif self._few and not self._space:
-            shape = (-1, self._fine, self._fine)
-            values = regions(team.at(self.record.times[self.last]), x, self._view.points).reshape(shape).swapaxes(1, 2)
-            self._moves = [family for family in team.families if family.arity > 1 or family.tracks]
-            changing = {int(number) for family in self._moves for number in family.number}
-            self._still = np.array([number for number in range(len(team.owner)) if number not in changing], dtype=int)
-            self._areas, self._values = areas.areas(team, values), values
+            self._values = self._view.psi(team.at(self.record.times[self.last]), x)
+            self._moves = moves(team)
+            self._areas = areas.areas(team, self._values)
         elif self._few:
             self._areas = areas.areas(team)
         elif self._shapes is not None and not self._space and not self._line:
@@ -255,35 +248,32 @@ class Scene:
         self._wires = Line2D([], [], color=LINK, alpha=0.8, zorder=1.5, gid="link", **look)
         axes.add_artist(self._wires)
         self._names: list[Any] = []
+        every, robots = range(self.x.shape[1]), self._robots
+        if robots is not None:
+            self._crew = bodies.Crew(axes, robots, [colour(i) for i in every] if self._few else None)
+        crew = [] if self._crew is None else self._crew.artists
         if self._few:
-            every = range(self.x.shape[1])
+            room = 0.0 if robots is None else (robots.radius + robots.offset) / self._view.unit[0]
+            away = np.broadcast_to(np.maximum(7.0, 3 + 330 * room), len(every))
             self._paths = [axes.plot([], [], **_path(i))[0] for i in every]
             starts = [axes.plot(*trail[0, i, :, None], **_start(i))[0] for i in every]
             self._heads = [axes.plot([], [], **self._head(i))[0] for i in every]
-            self._crew = None if self._robots is None else bodies.Crew(axes, self._robots, [colour(i) for i in every])
             for i, name in enumerate(self._ids):
                 x, y = self._where[i]
                 place = {"ha": ("center", "left", "right")[round(x)], "va": ("center", "bottom", "top")[round(y)], "zorder": 6}
-                far = (
-                    7.0
-                    if self._robots is None
-                    else max(7.0, 3 + 330 * (self._robots.radius[i] + self._robots.offset[i]) / self._view.unit[0])
+                self._names.append(
+                    axes.annotate(name, trail[0, i], (away[i] * x, away[i] * y), textcoords="offset points", **_ink(i), **place)
                 )
-                self._names.append(axes.annotate(name, trail[0, i], (far * x, far * y), textcoords="offset points", **_ink(i), **place))
-            crew = [] if self._crew is None else self._crew.artists
             self.moving = [*ground, self._wires, *self._paths, *starts, *crew, *self._heads, *self._names]
             return
-        count = trail.shape[1]
         self._paths = [axes.plot([], [], color=TRAIL, linewidth=1.0, zorder=1, gid="path")[0]]
-        if count <= MOST_LINES:
-            size = 3.5 if count < 200 else 1.5
+        if len(every) <= MOST_LINES:
+            size = 3.5 if len(every) < 200 else 1.5
             axes.plot(*trail[0].T, "o", color=TRAIL, markerfacecolor="white", markersize=size, zorder=1.2, gid="start")
-        if self._robots is not None:
-            self._crew = bodies.Crew(axes, self._robots, None)
-            self.moving = [self._paths[0], self._wires, *self._crew.artists]
-            return
-        self._dots = axes.scatter(*trail[-1].T, **crowd.dots(count))
-        self.moving = [self._paths[0], self._wires, self._dots]
+        self.moving = [self._paths[0], self._wires, *crew]
+        if not crew:
+            self._dots = axes.scatter(*trail[-1].T, **crowd.dots(len(every)))
+            self.moving.append(self._dots)
 
     def show(self, moment: float) -> None:
         """Draw the formation at a moment."""
@@ -328,13 +318,10 @@ class Scene:
             seen = np.count_nonzero(self._columns <= moment)
             ground.show(between(self.steps, self._columns[:seen]), self._view.along[0], self._tube[:, :, :seen])
             return
-        if self._moves:
-            shape = self._values.shape
-            families = [family.at(self.record.time(moment)) for family in self._moves]
-            values = regions(cast(Team, self._team), self.record.where(moment), self._view.points, families)
-            values = values.reshape(shape[0], shape[2], shape[1]).swapaxes(1, 2)
-            values[self._still] = self._values[self._still]
-            self._values = values
+        if self._moves.any():
+            now = cast(Team, self._then(moment))
+            families = [family for family in now.families if self._moves[family.number].any()]
+            self._values[self._moves] = self._view.psi(now, self.record.where(moment), families)[self._moves]
         across, up = self._view.along
         ground.show(across, up, self._values)
 

@@ -6,18 +6,20 @@ The geometry is computed from the parameters, for views of crowds, in space, and
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from consat.problem.family import Family
 from consat.problem.team import Team
 
 BALLS: Final[Mapping[str, bool]] = {"within": False, "outside": True, "near": False, "apart": True, "displacement": False}
 """Kinds whose boundary is a ball. The value says whether the owner must stay outside."""
 WALLS: Final = ("halfspace", "box")
+MOST_SHAPES: Final = 20_000
+"""Most constraints of a team whose regions are drawn. Of a team with more, none is."""
 WAYS: Final = 20
 """Number of times at which moving balls are sampled for a view that holds their motion, about."""
 
@@ -33,7 +35,7 @@ class Balls:
         keeps_out: (K,) whether the owners must stay outside.
         moves: (K,) whether the ball moves, with an agent or by a schedule.
         owners: for each ball the indices of its owners, ascending.
-        number: (K,) index of the constraint; of several, the first.
+        numbers: for each ball the indices of its constraints, ascending.
     """
 
     center: np.ndarray
@@ -42,11 +44,16 @@ class Balls:
     keeps_out: np.ndarray
     moves: np.ndarray
     owners: tuple[tuple[int, ...], ...]
-    number: np.ndarray
+    numbers: list[list[int]]
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """(K, d) absolute centres, with the team at x (N, d)."""
         return self.center + np.where(self.around[:, None] >= 0, x[self.around], 0.0)
+
+    def boxes(self, x: np.ndarray) -> np.ndarray:
+        """(K, 2, d) boxes around the balls, low and high corner, with the team at x (N, d)."""
+        center, radius = self.at(x)[:, None], self.radius[:, None, None]
+        return np.concatenate([center - radius, center + radius], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +64,13 @@ class Walls:
         normal: (K, d) unit vector towards the forbidden side.
         offset: (K,) distance of the boundary from the origin, along `normal`.
         owners: for each half-space the indices of its owners, ascending.
-        number: (K,) index of the constraint; of several, the first.
+        numbers: for each half-space the indices of its constraints, ascending.
     """
 
     normal: np.ndarray
     offset: np.ndarray
     owners: tuple[tuple[int, ...], ...]
-    number: np.ndarray
+    numbers: list[list[int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,51 +90,57 @@ class Shapes:
 
 def shapes(team: Team, time: float = 0.0) -> Shapes:
     """The geometry of a team's constraints at a time, s. Number and order of balls and walls are the same at all times."""
-    ties = moves(team)
-    balls: dict[Hashable, list[Any]] = {}
-    walls: dict[Hashable, list[Any]] = {}
-    others: dict[Hashable, int] = {}
-    for key, family, k in _distinct(team, time):
-        number, owner = int(family.number[k]), int(family.owner[k])
-        given = {name: value[k] for name, value in family.parameters.items()}
-        if family.kind in BALLS and "radius" in given and family.sources is None:
-            center = given.get("center", given.get("vector", np.zeros(team.dimension)))
-            around = int(family.agents[k, 1]) if family.arity == 2 else -1
-            entry = balls.setdefault(key, [center, around, float(given["radius"]), BALLS[family.kind], [], number])
-            entry[4].append(owner)
-            entry[5] = min(entry[5], number)
-        elif family.kind in WALLS and (wall := _wall(given)) is not None:
-            entry = walls.setdefault(key, [*wall, [], number])
-            entry[2].append(owner)
-            entry[3] = min(entry[3], number)
-        else:
-            others[key] = min(others.get(key, number), number)
+    first, ties = alike(team), moves(team)
+    numbers: dict[int, list[int]] = defaultdict(list)
+    for number, same in enumerate(first.tolist()):
+        numbers[same].append(number)
+    balls: list[tuple[Any, ...]] = []
+    walls: list[tuple[Any, ...]] = []
+    others: list[int] = []
+    for family in team.at(time).families:
+        for k in np.flatnonzero(first[family.number] == family.number).tolist():
+            number, given = int(family.number[k]), {name: value[k] for name, value in family.parameters.items()}
+            if family.kind in BALLS and "radius" in given and family.sources is None:
+                center = given.get("center", given.get("vector", np.zeros(team.dimension)))
+                around = int(family.agents[k, 1]) if family.arity == 2 else -1
+                balls.append((center, around, given["radius"], BALLS[family.kind], ties[number], numbers[number]))
+            elif family.kind in WALLS and (wall := _wall(given)) is not None:
+                walls.append((*wall, numbers[number]))
+            else:
+                others.append(number)
+
+    def column(rows: list[tuple[Any, ...]], place: int, kind: type = float) -> np.ndarray:
+        return np.array([row[place] for row in rows], dtype=kind)
+
+    def owners(rows: list[tuple[Any, ...]]) -> tuple[tuple[int, ...], ...]:
+        return tuple(tuple(np.asarray(team.owner)[row[-1]].tolist()) for row in rows)
+
+    def vectors(rows: list[tuple[Any, ...]]) -> np.ndarray:
+        return column(rows, 0).reshape(-1, team.dimension)
+
     return Shapes(
         Balls(
-            np.array([entry[0] for entry in balls.values()], dtype=float).reshape(-1, team.dimension),
-            np.array([entry[1] for entry in balls.values()], dtype=int),
-            np.array([entry[2] for entry in balls.values()], dtype=float),
-            np.array([entry[3] for entry in balls.values()], dtype=bool),
-            np.array([ties[entry[5]] for entry in balls.values()], dtype=bool),
-            tuple(tuple(sorted(entry[4])) for entry in balls.values()),
-            np.array([entry[5] for entry in balls.values()], dtype=int),
+            vectors(balls), column(balls, 1, int), column(balls, 2), column(balls, 3, bool), column(balls, 4, bool),
+            owners(balls), [row[-1] for row in balls],
         ),
-        Walls(
-            np.array([entry[0] for entry in walls.values()], dtype=float).reshape(-1, team.dimension),
-            np.array([entry[1] for entry in walls.values()], dtype=float),
-            tuple(tuple(sorted(entry[2])) for entry in walls.values()),
-            np.array([entry[3] for entry in walls.values()], dtype=int),
-        ),
-        np.array(sorted(others.values()), dtype=int),
-    )
+        Walls(vectors(walls), column(walls, 1), owners(walls), [row[-1] for row in walls]),
+        np.array(sorted(others), dtype=int),
+    )  # fmt: skip
 
 
 def alike(team: Team) -> np.ndarray:
-    """(M,) for each constraint the index of the first one that has the same region at all positions and times; it may be itself."""
-    first: dict[Hashable, int] = {}
-    found = np.arange(len(team.owner))
-    for key, family, k in sorted(_distinct(team), key=lambda each: int(each[1].number[each[2]])):
-        found[family.number[k]] = first.setdefault(key, int(family.number[k]))
+    """(M,) for each constraint the index of the first one that has the same region at all positions and times; it may be itself.
+
+    Regions are the same for the same function, the same parameters at all times, and the same agents besides the owner.
+    """
+    found, instants = np.arange(len(team.owner)), team.instants
+    for place, family in enumerate(team.families):
+        told = [np.ascontiguousarray(value) for instant in instants for _, value in sorted(instant.families[place].parameters.items())]
+        first: dict[Hashable, int] = {}
+        for k in np.argsort(family.number).tolist():
+            reads = tuple(-1 if agent == family.owner[k] else int(agent) for agent in family.agents[k])
+            number = int(family.number[k])
+            found[number] = first.setdefault((reads, *(value[k].tobytes() for value in told)), number)
     return found
 
 
@@ -162,24 +175,8 @@ def ways(team: Team, times: np.ndarray) -> np.ndarray:
     if team.moves:
         for time in times[:: max(1, len(times) // WAYS)].tolist():
             balls = shapes(team, time).balls
-            which = balls.moves & (balls.around < 0)
-            center, radius = balls.center[which, None], balls.radius[which, None, None]
-            found.append(np.concatenate([center - radius, center + radius], axis=1))
+            found.append(balls.boxes(np.zeros((team.count, team.dimension)))[balls.moves & (balls.around < 0)])
     return np.concatenate(found)
-
-
-def _distinct(team: Team, time: float = 0.0) -> Iterator[tuple[Hashable, Family, int]]:
-    """Yield (key, family, row) for every constraint at a time. Constraints with the same region have the same key.
-
-    The key holds the function, the parameters at all times, and the agents that ψ reads besides its owner.
-    """
-    instants = team.instants
-    for place, family in enumerate(team.at(time).families):
-        told = [sorted(instant.families[place].parameters.items()) for instant in instants]
-        parameters = [np.ascontiguousarray(value) for each in told for _, value in each]
-        for k in range(family.size):
-            reads = tuple(-1 if agent == family.owner[k] else int(agent) for agent in family.agents[k])
-            yield (place, reads, *(value[k].tobytes() for value in parameters)), family, k
 
 
 def _wall(given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float] | None:

@@ -12,8 +12,8 @@ from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from consat.problem.team import Team
-from consat.views.areas import SHARED, colour_of
-from consat.views.figures import colour, grid, regions
+from consat.views.colours import SHARED, colour, colour_of
+from consat.views.regions import grid, regions
 from consat.views.shapes import Balls, Shapes, Walls
 
 MOST_BALLS: Final = 60
@@ -94,13 +94,11 @@ def _face(normal: np.ndarray, offset: float, low: np.ndarray, high: np.ndarray) 
     if len(low) == 2:
         along = np.array([-normal[1], normal[0]])
         corners = foot + size * np.array([-along, along])
-        for k, side in enumerate(sides):
-            corners = _cut(_cut(corners, side, high[k]), -side, -low[k])
-        return corners
-    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    across /= np.linalg.norm(across)
-    up = np.cross(normal, across)
-    corners = foot + size * np.array([across + up, across - up, -across - up, -across + up])
+    else:
+        across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        across /= np.linalg.norm(across)
+        up = np.cross(normal, across)
+        corners = foot + size * np.array([across + up, across - up, -across - up, -across + up])
     for k, side in enumerate(sides):
         corners = _cut(_cut(corners, side, high[k]), -side, -low[k])
     return corners

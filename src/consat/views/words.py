@@ -1,4 +1,4 @@
-"""Text of a run's summary, as ``print(result)`` shows it."""
+"""Texts: of a run's summary, as ``print(result)`` shows it, and of the numbers, names and labels of figures and pages."""
 
 from __future__ import annotations
 
@@ -258,6 +258,16 @@ def number(value: float | None, digits: int = 4, missing: str = "none") -> str:
 def typeset(value: float | None, missing: str = "none") -> str:
     """A number as text of figures and pages: three digits, an integer from 1000 to 10⁶, a true minus sign; `missing` for None."""
     return missing if value is None else (f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
+
+
+def plain(text: str, longest: int = 34) -> str:
+    """A name as text for matplotlib: shortened to `longest` characters, with dollar signs escaped, which else begin a formula."""
+    return (text if len(text) <= longest else text[: longest - 1] + "…").replace("$", r"\$")
+
+
+def label(what: str, unit: str | None) -> str:
+    """Label of an axis: the quantity, and the unit if there is one."""
+    return what if unit is None else f"{what} [{plain(unit)}]"
 
 
 def _short(name: str) -> str:

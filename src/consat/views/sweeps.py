@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
-from consat.views.figures import COLOURS, DPI, GREY, MARKERS, STYLES, plain
+from consat.errors import counted
+from consat.views.colours import COLOURS, GREY, MARKERS, STYLES
+from consat.views.figures import DPI
+from consat.views.words import plain
 
 MOST_LINES, MOST_BANDS = 6, 3
 """Most values of the other parameters that have a line, and most lines whose spread is a band; with more lines it is bars."""
@@ -48,8 +51,8 @@ def draw(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Figur
 
 
 def _title(summary: Mapping[str, Any]) -> str:
-    seeds = len(summary["seeds"]) if len(summary["seeds"]) != 2 else summary["seeds"][1]
-    return f"{plain(summary['scenario'])}: {summary['protocol']}, {summary['estimates']} estimates, {seeds:,} seed{'s' * (seeds > 1)}"
+    seeds = counted(summary["groups"][0]["runs"], "seed")
+    return f"{plain(summary['scenario'])}: {summary['protocol']}, {summary['estimates']} estimates, {seeds}"
 
 
 def _unit(summary: Mapping[str, Any]) -> str:
@@ -135,11 +138,8 @@ def _seeds(figure: Figure, summary: Mapping[str, Any], runs: Sequence[Mapping[st
     panels = figure.subplots(2, 1)
     [group] = summary["groups"]
     whole = group["messages"] is not None
-    bins: dict[str, Callable[[np.ndarray], Any]] = {
-        "satisfied_from": lambda found: np.arange(found.min() - 0.5, found.max() + 1.5) if whole and np.ptp(found) < 60 else 40,
-        "margin": lambda found: 40,
-    }
-    for panel, (name, choose), label in zip(panels, bins.items(), (_unit(summary), r"last margin $\barβ$"), strict=True):
+    for panel, name, label in zip(panels, ("satisfied_from", "margin"), (_unit(summary), r"last margin $\barβ$"), strict=True):
+        rounds = whole and name == "satisfied_from"
         found = np.array([run[name] for run in runs if run[name] is not None], dtype=float)
         panel.set(xlabel=label, ylabel="runs")
         panel.grid(axis="y", color="0.92", linewidth=0.8)
@@ -148,14 +148,8 @@ def _seeds(figure: Figure, summary: Mapping[str, Any], runs: Sequence[Mapping[st
         if not len(found):
             panel.text(0.5, 0.5, "no run got there", transform=panel.transAxes, ha="center", color=GREY)
             continue
-        panel.hist(
-            found,
-            bins=choose(found),
-            color=COLOURS[0],
-            edgecolor="white",
-            linewidth=0.5,
-            rwidth=0.9 if name == "satisfied_from" and whole else 1.0,
-        )
+        bins = np.arange(found.min() - 0.5, found.max() + 1.5) if rounds and np.ptp(found) < 60 else 40
+        panel.hist(found, bins=bins, color=COLOURS[0], edgecolor="white", linewidth=0.5, rwidth=0.9 if rounds else 1.0)
         median = float(np.median(found))
         panel.axvline(median, color=COLOURS[1], linewidth=1.8)
         panel.text(median, 1.0, f" median {median:.3g}", transform=panel.get_xaxis_transform(), va="bottom", ha="center", color=COLOURS[1])

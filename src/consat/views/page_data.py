@@ -7,19 +7,15 @@ indices of agents in the team; ``names`` are the names of their constraints, in 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from consat.problem.team import Team
 from consat.views import space
-from consat.views.figures import view
-from consat.views.shapes import Shapes, Walls, alike, boxes, shapes, ways
-
-MOST_SHAPES: Final = 20_000
-"""Most constraints of a team whose regions are drawn. Of a team with more, none is."""
-FEW: Final = 12
-"""Most agents that have colours of their own. The pages' script has the same number."""
+from consat.views.colours import FEW
+from consat.views.regions import view
+from consat.views.shapes import MOST_SHAPES, Balls, Walls, boxes, shapes, ways
 
 
 def frame(
@@ -43,41 +39,29 @@ def frame(
     dimension, balls = x.shape[2], shapes(team, float(times[-1])).balls
     around = [boxes(team)[:, :, :dimension], ways(team, times)[:, :, :dimension], *([] if stand is None else [stand])]
     if team.dimension <= 3:
-        center, radius = balls.at(x[-1])[:, None, :dimension], balls.radius[:, None, None]
-        fixed = np.concatenate([center - radius, center + radius], axis=1)
-        around.append(fixed if x.shape[1] <= FEW else fixed[balls.around < 0])
+        every = balls.boxes(x[-1])
+        around.append(every if x.shape[1] <= FEW else every[balls.around < 0])
     low, high, _ = view(x, x[-1], None, np.concatenate(around))
     return low, high
 
 
-def constraints_of(team: Team, found: Shapes) -> tuple[list[list[int]], list[list[int]]]:
-    """Indices of the constraints that each ball, and each half-space, stands for."""
-    members: dict[int, list[int]] = {}
-    first = alike(team)
-    for number, same in enumerate(first.tolist()):
-        members.setdefault(same, []).append(number)
-    balls, walls = ([members[int(first[number])] for number in each.number] for each in (found.balls, found.walls))
-    return balls, walls
-
-
-def balls_of(team: Team, found: Shapes, members: list[list[int]]) -> list[dict[str, Any]]:
-    """Balls as plain data, for a team of at most three dimensions; else empty. `members`: from `constraints_of`."""
-    balls = found.balls
+def balls_of(team: Team, balls: Balls) -> list[dict[str, Any]]:
+    """Balls as plain data, for a team of at most three dimensions; else empty."""
     return [
         {
             "center": balls.center[k].tolist(),
             "around": int(balls.around[k]),
             "radius": float(balls.radius[k]),
             "out": bool(balls.keeps_out[k]),
-            "owners": [int(team.owner[number]) for number in members[k]],
-            "names": [team.names[number] for number in members[k]],
+            "owners": list(balls.owners[k]),
+            "names": [team.names[number] for number in balls.numbers[k]],
         }
         for k in range(len(balls.radius))
         if team.dimension <= 3
     ]
 
 
-def walls_of(team: Team, walls: Walls, members: list[list[int]], low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
+def walls_of(team: Team, walls: Walls, low: np.ndarray, high: np.ndarray) -> list[Mapping[str, Any]]:
     """Boundaries of half-spaces as plain data: polygons within the view, or lines for a team in the plane.
 
     The sides of a box are cut by each other.
@@ -85,7 +69,6 @@ def walls_of(team: Team, walls: Walls, members: list[list[int]], low: np.ndarray
     Args:
         team: the team.
         walls: its half-spaces.
-        members: for each half-space the constraints that it stands for, from `constraints_of`.
         low: lower corner of the view.
         high: upper corner of the view.
     """
@@ -97,8 +80,8 @@ def walls_of(team: Team, walls: Walls, members: list[list[int]], low: np.ndarray
             "corners": np.round(corners, 6).tolist(),
             "normal": walls.normal[k].tolist(),
             "offset": float(walls.offset[k]),
-            "owners": [int(team.owner[number]) for number in members[k]],
-            "names": [team.names[number] for number in members[k]],
+            "owners": list(walls.owners[k]),
+            "names": [team.names[number] for number in walls.numbers[k]],
             "place": k,
         }
         for k, corners in space.faces(walls, low - beyond, high + beyond)
