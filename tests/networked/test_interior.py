@@ -13,7 +13,8 @@ import pytest
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard, pair_core
-from consat.network.node.core import Embodied, Moment
+from consat.network.node.core import Moment
+from consat.network.node.embodied import Embodied
 from consat.network.node.modes import NodeSettings, core_of
 from consat.network.node.pairs import HEAD, MessageLayout, Packing
 from consat.network.node.part import split
@@ -312,12 +313,12 @@ def moment(made: Embodied) -> Moment:
 @float64
 def test_a_turn_is_compiled_once() -> None:
     made = core()
-    compiled = pair_core._compiled()[1]
-    compiled.clear_cache()  # type: ignore[attr-defined]
+    compiled = pair_core._turn.program()  # type: ignore[attr-defined]
+    compiled.clear_cache()
     state = made.begin(made.part.first)
     for _ in range(3):
         state, _, _ = made.turn(state, *made.empty(), moment(made))
-    assert compiled._cache_size() == 1  # type: ignore[attr-defined]
+    assert compiled._cache_size() == 1
 
 
 @float64
@@ -365,7 +366,7 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
     mail = jax.tree.map(drawn, interior.silence())
     numbers = np.asarray(packing.pack(mail._replace(changes=np.full(2, 3.0))))
     assert [np.flatnonzero(row)[-1] + 1 for row in numbers] == [layout.length for layout in layouts]
-    back = packing.unpack(numbers, width)
+    back = packing.unpack(numbers)
     assert np.asarray(back.changes).tolist() == [3.0, 3.0]
     for row, layout in enumerate(layouts):
         p, q = layout.size, layout.size - 1

@@ -28,7 +28,8 @@ from consat.faults import Faults
 from consat.network.deploy.output import Output
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
 from consat.network.node.commander import Commander
-from consat.network.node.core import Embodied, Moment
+from consat.network.node.core import Moment
+from consat.network.node.embodied import Embodied
 from consat.network.node.membership import Membership
 from consat.network.node.modes import NodeSettings, Runner, core_of, runner_of
 from consat.network.node.orders import Order, Orders, heeding_signals

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from consat.network.node.core import AgentView, Embodied, Moment, Rows
+from consat.network.node.core import Moment, Rows
+from consat.network.node.embodied import AgentView, Embodied
 
 
 class Turn(NamedTuple):

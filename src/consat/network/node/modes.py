@@ -12,15 +12,16 @@ import numpy as np
 
 from consat.errors import InvalidSettings
 from consat.network.node.body import Body
-from consat.network.node.core import Embodied, RoundCore
+from consat.network.node.embodied import Embodied
 from consat.network.node.fixed_rate import FixedRate
 from consat.network.node.link_core import LinkCore
 from consat.network.node.lockstep import Lockstep
 from consat.network.node.pair_core import PairCore
 from consat.network.node.part import RUNS, Part
+from consat.network.node.round_core import RoundCore
 from consat.network.node.station import REPORT, Log, Station
 from consat.network.transports import Transport
-from consat.protocols import PAIRED, ROUNDS, with_gains
+from consat.protocols import PAIRED, ROUNDS, GradientFlow, with_gains
 from consat.protocols.sending import BEAT
 from consat.settings import Sends
 
@@ -152,8 +153,8 @@ def core_of(part: Part, settings: NodeSettings) -> Embodied:
     asked = part.settings.protocol
     kind = protocol_of(settings.mode, asked.kind)
     if settings.mode == "link":
-        gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
-        return Embodied(LinkCore(part, gains["k1"] * settings.pace, gains["k2"] * settings.pace))
+        gains = (1.0 if gain is None else gain for gain in (asked.k1, asked.k2))
+        return Embodied(LinkCore(GradientFlow(*(gain * settings.pace for gain in gains)), part))
     protocol = with_gains(ROUNDS[kind](), asked)
     return Embodied(PairCore(protocol, part) if kind in PAIRED else RoundCore(protocol, part))
 

@@ -13,7 +13,8 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam
 from consat.network.node import guard
 from consat.network.node.body import Body
-from consat.network.node.core import LARGEST, AgentView, Embodied, Moment, Rows
+from consat.network.node.core import LARGEST, Moment, Rows
+from consat.network.node.embodied import AgentView, Embodied
 from consat.network.node.membership import Membership
 from consat.network.node.neighbours import Peers
 from consat.network.node.news import NewsFilter
