@@ -13,9 +13,10 @@ import pytest
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard, pair_core
+from consat.network.node.build import core_of
 from consat.network.node.core import Moment
 from consat.network.node.embodied import Embodied
-from consat.network.node.modes import NodeSettings, core_of
+from consat.network.node.modes import NodeSettings
 from consat.network.node.pairs import HEAD, MessageLayout, Packing
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
@@ -143,7 +144,7 @@ def test_a_proof_of_another_team_is_not_used() -> None:
     last = station.peers.all["a2"].last
     assert last is not None
     inbox, arrived = station.core.empty()
-    station.deliver("a2", last.arrays, inbox, arrived)
+    station.codec.decode("a2", last.arrays, inbox, arrived)
     assert arrived.pair.tolist() == [True]
     found = {}
     for mine, theirs in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)):

@@ -15,8 +15,9 @@ from consat.network.deploy.dashboard import table
 from consat.network.deploy.environment import prepare
 from consat.network.deploy.observer import Observer
 from consat.network.node.body import CONFIRMED, MeasuredBody, Measurement, SimulatedBody
+from consat.network.node.build import core_of
 from consat.network.node.membership import Membership
-from consat.network.node.modes import NodeSettings, core_of
+from consat.network.node.modes import NodeSettings
 from consat.network.node.persistence import Store
 from consat.network.transports.faults import FaultyTransport
 from consat.network.transports.memory import LATENCY, MemoryNetwork

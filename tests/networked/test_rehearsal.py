@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from consat.network.node.core import IndexMap, Moment, Rows, StepResult
 from consat.network.node.embodied import Embodied
 from consat.network.node.fixed_rate import FixedRate
 from consat.network.node.link_core import LinkCore, LinkState
-from consat.network.node.modes import NodeSettings, Runner
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
+from consat.network.node.runner import Runner
 from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import float64
@@ -286,7 +288,8 @@ class Naive(LinkCore):
 def sampled(core: type[LinkCore]) -> Any:
     def build(part: Any, settings: NodeSettings, transport: Any, **options: Any) -> Runner:
         made = Embodied(core(GradientFlow(), part))
-        return FixedRate(Station(part, made, "link", transport, **options), {"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
+        own = replace(settings, rate={"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
+        return FixedRate(Station(part, made, own, transport, **options))
 
     return build
 

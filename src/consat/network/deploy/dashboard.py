@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from consat.network.deploy.observer import AgentRecord, Observer
-from consat.network.node.station import REPORT
+from consat.network.node.modes import REPORT
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -27,14 +27,16 @@ from consat.errors import InvalidInput, InvalidSettings, InvalidTeam
 from consat.faults import Faults
 from consat.network.deploy.output import Output
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
+from consat.network.node.build import core_of, runner_of
 from consat.network.node.commander import Commander
 from consat.network.node.core import Moment
 from consat.network.node.embodied import Embodied
 from consat.network.node.membership import Membership
-from consat.network.node.modes import NodeSettings, Runner, core_of, runner_of
+from consat.network.node.modes import NodeSettings
 from consat.network.node.orders import Order, Orders, heeding_signals
 from consat.network.node.part import Part
 from consat.network.node.pilot import RobotBody
+from consat.network.node.runner import Runner
 from consat.network.node.station import Station
 from consat.network.transports import Transport
 from consat.network.transports.faults import FaultyTransport

@@ -13,8 +13,10 @@ import jax
 import numpy as np
 
 from consat.network.node.body import SimulatedBody
-from consat.network.node.modes import NodeSettings, Runner, runner_of
+from consat.network.node.build import runner_of
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import Part
+from consat.network.node.runner import Runner
 from consat.network.transports.memory import MemoryNetwork
 
 OPENING = 0.01
