@@ -341,10 +341,13 @@ def _start(part: Part, options: ProcessOptions) -> np.ndarray:
 
 @contextmanager
 def _transport(part: Part, settings: NodeSettings, options: ProcessOptions) -> Iterator[Transport]:
-    from consat.network import keys
     from consat.network.transports.zenoh import connect
 
-    credentials = None if options.keys is None else keys.load(options.keys, part.me)
+    credentials = None
+    if options.keys is not None:
+        from consat.network.keys import load
+
+        credentials = load(options.keys, part.me)
     listen, *others = (_protected(address) if credentials else address for address in (part.listen, *(n.address for n in part.neighbours)))
     addresses = {neighbour.id: address for neighbour, address in zip(part.neighbours, others, strict=True)}
     transport = connect(part.run, part.me, listen, addresses, reliable=settings.reliable, credentials=credentials)
