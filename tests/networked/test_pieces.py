@@ -32,7 +32,6 @@ def test_a_store_gives_back_the_last_record(tmp_path: Path) -> None:
     assert store.load() is None
     for k in range(5):
         store.save(b"%d" % k * (k + 1))
-    store.close()
     again = Store(tmp_path / "state", 64)
     assert again.load() == b"44444"
     again.save(b"next")
@@ -46,7 +45,6 @@ def test_a_store_with_a_torn_record_gives_the_one_before(tmp_path_factory: pytes
     store = Store(path, 64)
     store.save(b"old" * 20)
     store.save(b"new" * 21)
-    store.close()
     data = bytearray(path.read_bytes())
     data[at] ^= flip
     path.write_bytes(data)
@@ -168,7 +166,7 @@ def test_a_simulated_body_moves_straight_and_no_faster_than_allowed() -> None:
 
 
 def test_a_measured_body_stands_still_until_it_is_measured() -> None:
-    body = MeasuredBody(speed=1.0, lag=0.5)
+    body = MeasuredBody(speed=1.0)
     assert body.follow(np.ones(2), 0.0).tolist() == [0.0, 0.0]
     assert body.measure(Measurement(np.array([1.0, 0.9]), 1.0)) is None
     np.testing.assert_allclose(body.follow(np.ones(2), 1.0), [0.0, 0.2])  # 0.1 in 0.5 s

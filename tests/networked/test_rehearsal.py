@@ -211,13 +211,13 @@ def test_links_that_carry_nothing_shorten_no_way() -> None:
 def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
     team = rehearse(NodeSettings("admm", rate=50.0))
     team.run(3.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
     team.kill("a3")
     team.run(2.0)
-    assert not any(runner.station.satisfied for runner in team.runners.values())
+    assert not any(runner.station.known == "satisfied" for runner in team.runners.values())
     team.start("a3")
     team.run(3.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
 
 
 def test_every_agent_learns_that_all_are_satisfied() -> None:

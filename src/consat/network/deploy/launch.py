@@ -235,7 +235,7 @@ def _ending(supervisor: Supervisor, rules: _Rules) -> Ending | None:
     observer, stop, earliest = supervisor.observer, supervisor.plan.ending, supervisor.earliest
     if stop == "never":
         return None
-    latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in observer.present_records)
+    latest = observer.latest
     known, since = observer.all_known()[0], observer.concluded()
     since = None if since is None else max(since, earliest)
     if (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -65,17 +66,16 @@ class Rehearsal:
         for agent in agents or tuple(self.parts):
             part = self.parts[agent]
             self._incarnations[agent] += 1
-            settings = NodeSettings(**({field: getattr(self.settings, field) for field in self.settings.__dataclass_fields__} | changes))
             with jax.enable_x64(True):
                 self.runners[agent] = self._build(
-                    part, settings, self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
+                    part, replace(self.settings, **changes), self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
                     clock=self.network.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
-                    wall=functools.partial(self._wall, self._skew.get(agent, 0.0)),
+                    wall=functools.partial(self._wall, agent),
                 )  # fmt: skip
             self._due[agent] = self.network.now + OPENING
 
-    def _wall(self, skew: float) -> float:
-        return self.network.now + skew
+    def _wall(self, agent: str) -> float:
+        return self.network.now + self._skew.get(agent, 0.0)
 
     def kill(self, *agents: str) -> None:
         """End agents without notice, as a crash does."""
@@ -100,19 +100,13 @@ class Rehearsal:
                 ready = self.network.deliver() & self.runners.keys()
                 ready |= {agent for agent, due in self._due.items() if due <= self.network.now}
                 for agent in sorted(ready):
-                    self._step(agent)
+                    self._due[agent] = max(self.runners[agent].step(), self.network.now + SHORTEST)
+                    if self.runners[agent].done:
+                        self.kill(agent)
                 if until():
                     return True
         self.network.now = end
         return until()
-
-    def _step(self, agent: str) -> None:
-        runner = self.runners[agent]
-        due = runner.step()
-        if runner.done:
-            self.kill(agent)
-            return
-        self._due[agent] = max(due, self.network.now + SHORTEST)
 
     def positions(self) -> dict[str, np.ndarray]:
         """The current position of each body, (d,), by id."""

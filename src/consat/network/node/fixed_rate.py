@@ -70,13 +70,13 @@ class FixedRate(Runner):
         self._begun = all(heard) or late
         if self._begun:
             self._due = self._last = now
-            self._state = station.core.begin(station.present_rows(station.first()), station.now())
+            self._state = station.core.begin(station.first(), station.now())
         return self._begun
 
     def _turn(self, now: float) -> None:
         station = self.station
         if station.changed:
-            self._state = station.regroup(self._state, station.first())
+            self._state = station.regroup(self._state)
             self._regrouped = self._round
         self._state = station.check_restarts(self._state)
         inbox, arrived = station.core.empty()
@@ -90,6 +90,6 @@ class FixedRate(Runner):
         self._last = now
         self._round += 1
         outbox, listeners = station.filter(outbox)
-        station.send(station.codec.encode(outbox), among=listeners)
+        station.send(station.codec.encode(outbox), listeners)
         station.move(view, now)
         self.done = station.settings.turns is not None and self._round >= station.settings.turns

@@ -67,7 +67,7 @@ class Lockstep(Runner):
                 self._say_farewell()
             return self._sent_at + RESEND
         if self._state is None and station.body.position() is not None:
-            self._state = station.core.begin(station.present_rows(station.first()))
+            self._state = station.core.begin(station.first())
         if self._state is not None:
             if station.changed:
                 self._regroup()
@@ -166,8 +166,8 @@ class Lockstep(Runner):
         time = (self._round + 1.0) * self._tick
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
-    def _send(self, now: float, among: AbstractSet[str] | None = None) -> None:
-        """Send the message of this round to the neighbours in `among` (None for all), and to the others that it brings no news."""
+    def _send(self, now: float, to: AbstractSet[str] | None = None) -> None:
+        """Send the message of this round to the neighbours `to` (None for all), and to the others that it brings no news."""
         station = self.station
         assert self._outbox is not None
         current, previous = map(station.codec.encode, self._outbox)
@@ -175,14 +175,14 @@ class Lockstep(Runner):
         self._message = {neighbour: [*arrays, *previous[neighbour], number] for neighbour, arrays in current.items()}
         self._lacking.clear()
         self._sent_at = now
-        station.send(self._message, among=among)
-        if among is not None:
-            station.send_same(number, station.silent(among))
+        station.send(self._message, to)
+        if to is not None:
+            station.send_same(number, to)
 
     def _repeat(self, now: float) -> None:
         """Repeat the last message: to all neighbours while waiting, and after the last round to those that lack it."""
         station = self.station
-        to = [neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking]
+        to = {neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking}
         self._sent_at = now
         self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
@@ -194,7 +194,7 @@ class Lockstep(Runner):
     def _regroup(self) -> None:
         station = self.station
         before = station.core
-        self._state = station.regroup(self._state, station.first())
+        self._state = station.regroup(self._state)
         self._regrouped = self._round
         if self._outbox is None:
             return
@@ -235,9 +235,9 @@ class Lockstep(Runner):
         (number,), epochs, numbers = np.split(record, [1, 1 + len(ids)])
         self._round = int(number)
         station.membership.restore(ids, epochs)
-        station.regroup(None, station.part.first)
+        station.regroup(None)
         nothing, _ = station.core.empty()
-        like = (nothing, nothing), station.core.begin(station.present_rows(station.part.first))
+        like = (nothing, nothing), station.core.begin(station.first())
         leaves, structure = jax.tree.flatten(like)
         parts = np.split(numbers, np.cumsum([np.size(leaf) for leaf in leaves])[:-1])
         restored = [part.reshape(np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=True)]

@@ -100,22 +100,11 @@ class Peers:
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         echo, ack = (np.nan, 0) if peer.last is None else (peer.last.sent + (now - peer.heard), peer.last.sequence)
-        payload = encode(
-            Message(
-                kind,
-                self._problem,
-                self._part.me,
-                neighbour,
-                self._incarnation,
-                peer.sequence,
-                now,
-                echo,
-                ack,
-                float(self._part.nu.beta),
-                tuple(arrays),
-            ),
-            single,
-        )
+        message = Message(
+            kind, self._problem, self._part.me, neighbour, self._incarnation, peer.sequence, now, echo, ack, float(self._part.nu.beta),
+            tuple(arrays),
+        )  # fmt: skip
+        payload = encode(message, single)
         self._transport.send(neighbour, payload)
         self.sent["messages"] += 1
         self.sent["floats"] += sum(array.size for array in arrays)

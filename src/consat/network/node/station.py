@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from typing import Any, Final, Literal
@@ -74,7 +74,8 @@ class Station:
         self._strange = False
         self._born = clock()
         self._track: list[list[float]] = []
-        self._known: Knowledge = None
+        self.known: Knowledge = None
+        """What the agent knows about the team."""
         self._near = False
         self._down = frozenset(self.peers.all)
         self._next_report = clock()
@@ -82,7 +83,7 @@ class Station:
         self._view: AgentView | None = None
         self.target: np.ndarray | None = None
         """(d,) target of the body; None before the first step."""
-        self.regroup(None, part.first)
+        self.regroup(None)
 
     def _use(self, core: Embodied) -> None:
         """Make this the core of the agent."""
@@ -96,13 +97,9 @@ class Station:
         """Ids of the neighbours that are present."""
         return [neighbour.id for neighbour in self.core.part.neighbours]
 
-    def regroup(self, state: Any, first: np.ndarray) -> Any:
+    def regroup(self, state: Any) -> Any:
         """Rebuild the core for the agents that are present, and transfer the state to it. Nothing changes if the membership is the same.
-
-        Args:
-            state: the present state; None before the start.
-            first: (copies, d) initial estimates of all agents of the part.
-        """
+        `state`: the present state; None before the start."""
         gone = self.membership.gone
         if gone != self._gone:
             for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
@@ -112,12 +109,8 @@ class Station:
             self._use(before.without(gone))
             self._gone, self._view = gone, None
             if state is not None:
-                state = self.core.carry(before, state, self.present_rows(first), self._time)
+                state = self.core.carry(before, state, self.first(), self._time)
         return state
-
-    def present_rows(self, first: np.ndarray) -> np.ndarray:
-        """The rows of `first`, (copies, d), that belong to agents that are present."""
-        return first[[agent not in self._gone for agent in self.part.team.ids]]
 
     @property
     def changed(self) -> bool:
@@ -125,11 +118,11 @@ class Station:
         return self.membership.gone != self._gone
 
     def first(self) -> np.ndarray:
-        """(copies, d) initial estimates of all agents of the part, with the measured position for the agent itself."""
-        first = self.part.first.copy()
+        """(rows, d) initial estimates of the agents that are present, with the measured position for the agent itself."""
+        first = self.part.first[[agent not in self._gone for agent in self.part.team.ids]]
         position = self.body.position()
         if position is not None:
-            first[self.part.team.ids.index(self.part.me)] = position
+            first[self._me()] = position
         return first
 
     @property
@@ -138,19 +131,9 @@ class Station:
         return {} if self._view is None else dict(zip(self.core.part.team.ids, self._view.x, strict=True))
 
     @property
-    def satisfied(self) -> bool:
-        """Whether the agent knows that all agents are satisfied."""
-        return self._known == "satisfied"
-
-    @property
-    def known(self) -> Knowledge:
-        """What the agent knows about the team."""
-        return self._known
-
-    @property
     def settled(self) -> bool:
         """Whether the agent knows a final result: all are satisfied, or the team is infeasible and near its best margin."""
-        return self.satisfied or (self._known == "infeasible" and self._near)
+        return self.known == "satisfied" or (self.known == "infeasible" and self._near)
 
     # -- constraints -------------------------------------------------------------------------------------------------------------------
 
@@ -182,7 +165,7 @@ class Station:
         else:
             self.part = replace(self.part, team=changed(team, changes))
             self._use(before.without(self._gone, self.part))
-            state = state and self.core.carry(before, state, self.present_rows(self.first()), self._time)
+            state = state and self.core.carry(before, state, self.first(), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state
 
@@ -233,31 +216,27 @@ class Station:
         if self._filter is not None:
             self._filter.resume(rows, np.asarray(state.bodies.position))
 
-    def send_same(self, round_: np.ndarray, to: Iterable[str]) -> None:
-        """Tell the neighbours `to` that a round brought no news. `round_`: (1,) the round."""
-        for neighbour in to:
-            self.peers.send(neighbour, Kind.SAME, [round_])
+    def send_same(self, round_: np.ndarray, but: AbstractSet[str]) -> None:
+        """Tell all neighbours but those in `but` that a round brought no news. `round_`: (1,) the round."""
+        for neighbour in self._listeners():
+            if neighbour not in but:
+                self.peers.send(neighbour, Kind.SAME, [round_])
 
     def send_hello(self) -> None:
         """Send a greeting, which contains the membership, to the neighbours."""
         for neighbour in self._listeners():
             self.peers.send(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
-    def send(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
+    def send(self, arrays: Mapping[str, list[np.ndarray]], to: AbstractSet[str] | None = None) -> None:
         """Send a state message.
 
         Args:
             arrays: see `Codec.encode`.
-            to: ids of the receivers; None for all neighbours that are present.
-            among: send only to receivers in this set; None for no limit.
+            to: ids of the receivers; None for all neighbours.
         """
-        for neighbour in self._listeners() if to is None else to:
-            if among is None or neighbour in among:
+        for neighbour in self._listeners():
+            if to is None or neighbour in to:
                 self.peers.send(neighbour, Kind.STATE, arrays[neighbour], self.codec.single(arrays[neighbour]))
-
-    def silent(self, among: AbstractSet[str]) -> list[str]:
-        """The present neighbours that are not in `among`."""
-        return [neighbour for neighbour in self._listeners() if neighbour not in among]
 
     def send_goodbye(self) -> None:
         """Send a goodbye: the process stops. An agent that leaves for good announces that in earlier messages."""
@@ -282,8 +261,7 @@ class Station:
 
     def delays(self) -> np.ndarray:
         """(E,) half the round-trip time to the neighbour at each end, s; 0 before it is known."""
-        trips = {neighbour: np.nan_to_num(peer.trip) for neighbour, peer in self.peers.all.items()}
-        return np.array([0.5 * trips[neighbour] for neighbour, _ in self.core.ends])
+        return np.array([0.5 * np.nan_to_num(self.peers.all[neighbour].trip) for neighbour, _ in self.core.ends])
 
     def fresh(self, within: float) -> np.ndarray:
         """(E,) whether a message of the neighbour at each end arrived within the last `within` s."""
@@ -327,16 +305,16 @@ class Station:
             stamp: round or time, s, of the event.
             lately: whether the others were heard recently. If not, the agent does not know where they are.
         """
-        view, before = self._view, (self._known, self._near)
-        self._known, self._near = None, False
+        view, before = self._view, (self.known, self._near)
+        self.known, self._near = None, False
         if view is not None and lately and view.known > 0:
-            self._known = "satisfied"
+            self.known = "satisfied"
         elif view is not None and view.bound < 0:
-            self._known, self._near = "infeasible", lately and view.near
-        if before != (self._known, self._near):
-            if self._known is None:
+            self.known, self._near = "infeasible", lately and view.near
+        if before != (self.known, self._near):
+            if self.known is None:
                 self.log("unsatisfied" if before[0] == "satisfied" else "undecided", stamp=stamp)
-            elif self._known == "satisfied":
+            elif self.known == "satisfied":
                 self.log("satisfied", stamp=stamp)
             elif view is not None:
                 self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=number(view.least))
