@@ -31,7 +31,6 @@ class FixedRate(Runner):
         self._period = station.settings.period
         self._latest: dict[str, Sequence[np.ndarray]] = {}
         self._due = self._last = station.clock()
-        self._begun = False
         self._first_heard: float | None = None
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
@@ -50,7 +49,7 @@ class FixedRate(Runner):
         if self._farewells:
             self._due += self._period
             self._say_farewell()
-        elif self._begun or self._ready(now):
+        elif self._state is not None or self._ready(now):
             self._due = max(self._due + self._period, now)
             self._turn(now)
         else:
@@ -60,18 +59,18 @@ class FixedRate(Runner):
         return self._due
 
     def _ready(self, now: float) -> bool:
+        """Whether the agent can begin; then it has a state."""
         station = self.station
         if station.body.position() is None or not station.timed:
             return False
         heard = [np.isfinite(station.peers.all[neighbour].heard) for neighbour in station.present]
         if any(heard) and self._first_heard is None:
             self._first_heard = now
-        late = self._first_heard is not None and now - self._first_heard > PATIENCE
-        self._begun = all(heard) or late
-        if self._begun:
-            self._due = self._last = now
-            self._state = station.core.begin(station.first(), station.now())
-        return self._begun
+        if not (all(heard) or (self._first_heard is not None and now - self._first_heard > PATIENCE)):
+            return False
+        self._due = self._last = now
+        self._state = station.core.begin(station.first(), station.now())
+        return True
 
     def _turn(self, now: float) -> None:
         station = self.station
