@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,9 @@ from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node.core import IndexMap, Moment, Rows, StepResult
 from consat.network.node.embodied import Embodied
-from consat.network.node.fixed_rate import FixedRate
 from consat.network.node.link_core import LinkCore, LinkState
 from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
-from consat.network.node.runner import Runner
-from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import float64
 from consat.protocols import GradientFlow
@@ -285,20 +281,14 @@ class Naive(LinkCore):
         return StepResult(state, Rows(outbox, said.pair), x)
 
 
-def sampled(core: type[LinkCore]) -> Any:
-    def build(part: Any, settings: NodeSettings, transport: Any, **options: Any) -> Runner:
-        made = Embodied(core(GradientFlow(), part))
-        own = replace(settings, rate={"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
-        return FixedRate(Station(part, made, own, transport, **options))
-
-    return build
-
-
 def test_the_flow_sampled_naively_goes_to_the_wrong_place() -> None:
     """And with its integral on the links, at the same rates and losses, it does not."""
     found = {}
     for core in (Naive, LinkCore):
-        team = rehearse(NodeSettings("link"), Faults(loss=0.3), build=sampled(core))
+        made = lambda part, _, core=core: Embodied(core(GradientFlow(), part))  # noqa: E731
+        team = Rehearsal(parts(), NodeSettings("link"), MemoryNetwork(Faults(loss=0.3)), core=made)
+        for agent, rate in {"a1": 10.0, "a2": 9.0, "a3": 11.0}.items():
+            team.start(agent, rate=rate)
         team.run(100.0)
         found[core] = off(team)
     assert found[Naive] > 0.02

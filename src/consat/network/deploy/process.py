@@ -196,15 +196,14 @@ class _Process:
         """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
         part, settings = begin.part, self.settings
         with _transport(part, settings, self.options) as transport:
-            runner = runner_of(
-                part, settings, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=self.body, log=self.write,
-                core=begin.core,
-            )  # fmt: skip
-            station = runner.station
+            incarnation = time.time_ns() // 1_000_000
+            station = Station(
+                part, begin.core, settings, transport, clock=time.monotonic, incarnation=incarnation, body=self.body, log=self.write
+            )
             station.membership.adopt(begin.membership)
             station.log("start", mode=settings.mode, run=part.run, pid=os.getpid(), rounds=settings.mode == "lockstep")
             try:
-                outcome = self._loop(runner, transport, reader)
+                outcome = self._loop(runner_of(station), transport, reader)
             except BaseException:
                 self.commander.halt()  # before the transport is closed, which may take long
                 raise

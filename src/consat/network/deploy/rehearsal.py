@@ -14,10 +14,12 @@ import jax
 import numpy as np
 
 from consat.network.node.body import SimulatedBody
-from consat.network.node.build import runner_of
+from consat.network.node.build import core_of, runner_of
+from consat.network.node.embodied import Embodied
 from consat.network.node.modes import NodeSettings
 from consat.network.node.part import Part
 from consat.network.node.runner import Runner
+from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
 
 OPENING = 0.01
@@ -34,7 +36,7 @@ class Rehearsal:
         settings: mode and rate of the agents.
         network: the simulated network.
         speed: largest speed of a body, length/s.
-        build: makes the runner of an agent; by default as a process does.
+        core: makes the core of an agent; by default as a process does.
         skew: by how much the Unix time of an agent is ahead of the time of the network, s, by id; 0 for agents that are not listed.
     """
 
@@ -45,7 +47,7 @@ class Rehearsal:
         network: MemoryNetwork,
         *,
         speed: float = np.inf,
-        build: Callable[..., Runner] = runner_of,
+        core: Callable[[Part, NodeSettings], Embodied] = core_of,
         skew: Mapping[str, float] | None = None,
     ) -> None:
         self.parts, self.settings, self.network = parts, settings, network
@@ -53,7 +55,7 @@ class Rehearsal:
         self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
         self._skew = skew or {}
-        self._build, self._incarnations = build, dict.fromkeys(parts, 0)
+        self._core, self._incarnations = core, dict.fromkeys(parts, 0)
         self._due: dict[str, float] = {}
 
     def start(self, *agents: str, **changes: Any) -> None:
@@ -64,14 +66,15 @@ class Rehearsal:
             **changes: fields of `NodeSettings` to change for these agents.
         """
         for agent in agents or tuple(self.parts):
-            part = self.parts[agent]
+            part, settings = self.parts[agent], replace(self.settings, **changes)
             self._incarnations[agent] += 1
+            endpoint = self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours])
             with jax.enable_x64(True):
-                self.runners[agent] = self._build(
-                    part, replace(self.settings, **changes), self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
-                    clock=self.network.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
-                    wall=functools.partial(self._wall, agent),
+                station = Station(
+                    part, self._core(part, settings), settings, endpoint, clock=self.network.clock, incarnation=self._incarnations[agent],
+                    body=self.bodies[agent], log=self.events.append, wall=functools.partial(self._wall, agent),
                 )  # fmt: skip
+                self.runners[agent] = runner_of(station)
             self._due[agent] = self.network.now + OPENING
 
     def _wall(self, agent: str) -> float:
