@@ -131,7 +131,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     absent = frozenset(team.ids) - script.begin.present
     parts = split(scenario, run=f"launch-{uuid.uuid4().hex[:12]}", addresses=addresses, absent=absent)
     size = scale(team)
-    starts = np.array([part.first[part.team.ids.index(agent)] for agent, part in parts.items()])
+    starts = np.array([part.first[part.own] for part in parts.values()])
     observer = Observer(team, starts, "round" if plan.mode == "lockstep" else "time")
     began = time.monotonic()
     with Fleet(parts, plan.options(), exact=plan.mode == "lockstep") as fleet:

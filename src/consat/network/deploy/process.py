@@ -332,7 +332,7 @@ def _measured(part: Part, options: ProcessOptions) -> MeasuredBody:
 
 
 def _start(part: Part, options: ProcessOptions) -> np.ndarray:
-    return part.first[part.team.ids.index(part.me)] if options.position is None else np.array(options.position, dtype=float)
+    return part.first[part.own] if options.position is None else np.array(options.position, dtype=float)
 
 
 @contextmanager

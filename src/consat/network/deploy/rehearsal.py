@@ -52,7 +52,7 @@ class Rehearsal:
     ) -> None:
         self.parts, self.settings, self.network = parts, settings, network
         self.events: list[dict[str, Any]] = []
-        self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
+        self.bodies = {agent: SimulatedBody(part.first[part.own], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
         self._skew = skew or {}
         self._core, self._incarnations = core, dict.fromkeys(parts, 0)

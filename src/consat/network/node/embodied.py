@@ -11,7 +11,7 @@ from jax import Array
 
 from consat.network.node.core import LARGEST, Core, IndexMap, Moment, Rows, without_silent
 from consat.network.node.part import Part
-from consat.network.node.problem import OwnSolver, ends
+from consat.network.node.problem import OwnSolver
 from consat.numerics import quickly_compiled
 from consat.protocols import agreement
 from consat.protocols.interior_point import near
@@ -66,7 +66,9 @@ class Embodied:
         self.largest = np.append(core.largest, np.full(added, LARGEST))
         self.ages = (*([core.width - 1] if core.width else []), self.width - 1)
         """Columns of the rows of links that count rounds."""
-        self._owners = owners_of(self.part)
+        direct = np.array([neighbour == agent for neighbour, agent in self.ends], dtype=bool)
+        row = np.asarray(core.solver.links.row)
+        self._owners = agreement.Owners.of(np.array([self.part.own]), row, direct, self.part.team.count)
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> EmbodiedState:
         """See `Core.begin`."""
@@ -112,14 +114,6 @@ class Embodied:
         fresh, before, index = _start(self.core.solver, first), state.bodies, IndexMap.of(self.core, other.core)
         kept = fresh._replace(position=index.rows(before.position, fresh.position), stale=index.rows(before.stale, fresh.stale))
         return EmbodiedState(self.core.carry(other.core, state.core, first, time), kept)
-
-
-def owners_of(part: Part) -> agreement.Owners:
-    """The agents whose positions the agent of a part holds, and the ends of links over which it accepts positions of their bodies."""
-    place, pairs = {agent: row for row, agent in enumerate(part.team.ids)}, ends(part)
-    row = np.array([place[agent] for _, agent in pairs], dtype=np.int64)
-    direct = np.array([neighbour == agent for neighbour, agent in pairs], dtype=bool)
-    return agreement.Owners.of(np.array([place[part.me]]), row, direct, part.team.count)
 
 
 def word_of(columns: Array) -> agreement.Word:

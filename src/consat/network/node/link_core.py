@@ -123,7 +123,7 @@ def _hear(solver: OwnSolver, state: LinkState, inbox: Array, arrived: Array) -> 
     fresh = (sure & ~mine)[:, 0].astype(inbox.dtype)
     count = solver.links.sum(fresh)
     taken = solver.links.sum(fresh[:, None] * there) / jnp.maximum(count, 1.0)[:, None]
-    others = jnp.arange(len(state.x)) != solver.me
+    others = jnp.arange(len(state.x), dtype=solver.own.dtype) != solver.own[0]
     return state._replace(
         x=jnp.where(((count > 0) & others)[:, None], taken, state.x),
         force=force,

@@ -122,7 +122,7 @@ class Station:
         first = self.part.first[[agent not in self._gone for agent in self.part.team.ids]]
         position = self.body.position()
         if position is not None:
-            first[self._me()] = position
+            first[self.core.part.own] = position
         return first
 
     @property
@@ -288,7 +288,7 @@ class Station:
             view: result of the last step.
             stamp: round or time, s, of the recorded position.
         """
-        self.target = view.x[self._me()]
+        self.target = view.x[self.core.part.own]
         self.body.follow(self.target, self.clock())
         position = self.body.position()
         if position is not None:
@@ -318,10 +318,6 @@ class Station:
                 self.log("satisfied", stamp=stamp)
             elif view is not None:
                 self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=number(view.least))
-
-    def _me(self) -> int:
-        """The agent's row among the agents that are present."""
-        return self.core.part.team.ids.index(self.part.me)
 
     def watch(self) -> float:
         """Log which neighbours went down or came up, and a report when one is due. Returns the time of the next report, s."""
@@ -355,7 +351,7 @@ class Station:
             estimate_margin = number(self.core.margin(view.x, self._time))
             if view.heard and position is not None:
                 bodies = view.bodies.copy()
-                bodies[self._me()] = position
+                bodies[self.core.part.own] = position
                 margin = number(self.core.margin(bodies, self._time))
         peers = {}
         for neighbour, peer in self.peers.all.items():
