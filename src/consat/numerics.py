@@ -100,6 +100,27 @@ def quick_compilation() -> dict[str, bool | int] | None:
     return {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
 
 
+def quickly_compiled(*static: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator: compile a function with `quick_compilation`, at its first call, because importing it must not start a backend. The
+    compiled function is ``function.program()``.
+
+    Args:
+        *static: names of arguments for each value of which the function is compiled anew.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        program = functools.cache(lambda: jax.jit(function, static_argnames=static, compiler_options=quick_compilation()))
+
+        @functools.wraps(function)
+        def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+            return program()(*args, **kwargs)
+
+        wrapped.program = program  # type: ignore[attr-defined]
+        return wrapped
+
+    return decorate
+
+
 def thorough_compilation() -> dict[str, bool | int | str] | None:
     """Compiler options for programs that run longer than they compile; None if the backend is not the CPU.
 

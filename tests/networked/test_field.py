@@ -105,22 +105,22 @@ smoothing: {nu_alpha: 5, nu_beta: 5}
 def test_no_one_is_satisfied_whose_body_is_lost() -> None:
     team = rehearse(MODES["admm"])
     team.run(5.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
     team.bodies["a2"].sensed = lambda now: False  # type: ignore[method-assign]
     team.run(0.5)
-    assert not any(runner.station.satisfied for runner in team.runners.values())
+    assert not any(runner.station.known == "satisfied" for runner in team.runners.values())
     del team.bodies["a2"].sensed
     team.run(0.5)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
 
 
 def test_in_lockstep_nobody_who_waits_stays_satisfied() -> None:
     team = rehearse(NodeSettings("lockstep", rate=100.0))
     team.run(5.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
     team.kill("a3")
     team.run(1.0)
-    assert not any(runner.station.satisfied for runner in team.runners.values())
+    assert not any(runner.station.known == "satisfied" for runner in team.runners.values())
 
 
 # -- one agent and its robot ---------------------------------------------------------------------------------------------------------------

@@ -13,8 +13,10 @@ import pytest
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard, pair_core
-from consat.network.node.core import Embodied, Moment
-from consat.network.node.modes import NodeSettings, core_of
+from consat.network.node.build import core_of
+from consat.network.node.core import Moment
+from consat.network.node.embodied import Embodied
+from consat.network.node.modes import NodeSettings
 from consat.network.node.pairs import HEAD, MessageLayout, Packing
 from consat.network.node.part import split
 from consat.network.transports.memory import MemoryNetwork
@@ -142,7 +144,7 @@ def test_a_proof_of_another_team_is_not_used() -> None:
     last = station.peers.all["a2"].last
     assert last is not None
     inbox, arrived = station.core.empty()
-    station.deliver("a2", last.arrays, inbox, arrived)
+    station.codec.decode("a2", last.arrays, inbox, arrived)
     assert arrived.pair.tolist() == [True]
     found = {}
     for mine, theirs in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)):
@@ -312,12 +314,12 @@ def moment(made: Embodied) -> Moment:
 @float64
 def test_a_turn_is_compiled_once() -> None:
     made = core()
-    compiled = pair_core._compiled()[1]
-    compiled.clear_cache()  # type: ignore[attr-defined]
+    compiled = pair_core._turn.program()  # type: ignore[attr-defined]
+    compiled.clear_cache()
     state = made.begin(made.part.first)
     for _ in range(3):
         state, _, _ = made.turn(state, *made.empty(), moment(made))
-    assert compiled._cache_size() == 1  # type: ignore[attr-defined]
+    assert compiled._cache_size() == 1
 
 
 @float64
@@ -365,7 +367,7 @@ def test_what_is_packed_is_unpacked_and_nothing_else_is_said() -> None:
     mail = jax.tree.map(drawn, interior.silence())
     numbers = np.asarray(packing.pack(mail._replace(changes=np.full(2, 3.0))))
     assert [np.flatnonzero(row)[-1] + 1 for row in numbers] == [layout.length for layout in layouts]
-    back = packing.unpack(numbers, width)
+    back = packing.unpack(numbers)
     assert np.asarray(back.changes).tolist() == [3.0, 3.0]
     for row, layout in enumerate(layouts):
         p, q = layout.size, layout.size - 1

@@ -16,10 +16,12 @@ import pytest
 
 from consat.network.deploy.rehearsal import Rehearsal
 from consat.network.node import guard
-from consat.network.node.core import Moment, RoundCore, Rows
+from consat.network.node.build import core_of
+from consat.network.node.core import Moment, Rows
 from consat.network.node.lockstep import Lockstep
 from consat.network.node.membership import MOST, Membership
-from consat.network.node.modes import NodeSettings, core_of
+from consat.network.node.modes import NodeSettings
+from consat.network.node.round_core import RoundCore
 from consat.network.wire import AHEAD, Kind, Message, encode
 from consat.numerics import float64
 from tests.networked.case_c import GOAL, parts, rehearse

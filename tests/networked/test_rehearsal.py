@@ -14,14 +14,14 @@ import pytest
 
 from consat.faults import Faults
 from consat.network.deploy.rehearsal import Rehearsal
-from consat.network.node.core import Embodied, IndexMap, Moment, Rows, StepResult
-from consat.network.node.fixed_rate import FixedRate
+from consat.network.node.core import IndexMap, Moment, Rows, StepResult
+from consat.network.node.embodied import Embodied
 from consat.network.node.link_core import LinkCore, LinkState
-from consat.network.node.modes import NodeSettings, Runner
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import split
-from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
 from consat.numerics import float64
+from consat.protocols import GradientFlow
 from consat.scenario import loads
 from tests.networked.case_c import ADMM, events, off, parts, rehearse
 from tests.networked.oracle import EVENTS, TRIALS
@@ -207,13 +207,13 @@ def test_links_that_carry_nothing_shorten_no_way() -> None:
 def test_nobody_claims_to_know_of_those_that_are_silent() -> None:
     team = rehearse(NodeSettings("admm", rate=50.0))
     team.run(3.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
     team.kill("a3")
     team.run(2.0)
-    assert not any(runner.station.satisfied for runner in team.runners.values())
+    assert not any(runner.station.known == "satisfied" for runner in team.runners.values())
     team.start("a3")
     team.run(3.0)
-    assert all(runner.station.satisfied for runner in team.runners.values())
+    assert all(runner.station.known == "satisfied" for runner in team.runners.values())
 
 
 def test_every_agent_learns_that_all_are_satisfied() -> None:
@@ -274,29 +274,21 @@ class Naive(LinkCore):
     def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         kept = state.force
         after, said, x, *_ = super().turn(state, inbox, arrived, moment._replace(fresh=np.zeros_like(moment.fresh)))
-        integral = kept + self.k1 * self.k2 * moment.elapsed * (self.solver.links.at(after.x) - after.there)
+        integral = kept + self.protocol.k1 * self.protocol.k2 * moment.elapsed * (self.solver.links.at(after.x) - after.there)
         state = after._replace(force=integral, theirs=-integral, valid=jnp.zeros_like(after.valid))
         outbox = said.link.copy()
         outbox[:, -1] = 0.0  # says nothing of its integral
         return StepResult(state, Rows(outbox, said.pair), x)
-
-    def without(self, gone: Any) -> "Naive":
-        return Naive(self.whole, self.k1, self.k2, gone)
-
-
-def sampled(core: type[LinkCore]) -> Any:
-    def build(part: Any, settings: NodeSettings, transport: Any, **options: Any) -> Runner:
-        made = Embodied(core(part, 1.0, 1.0))
-        return FixedRate(Station(part, made, "link", transport, **options), {"a1": 10.0, "a2": 9.0, "a3": 11.0}[part.me])
-
-    return build
 
 
 def test_the_flow_sampled_naively_goes_to_the_wrong_place() -> None:
     """And with its integral on the links, at the same rates and losses, it does not."""
     found = {}
     for core in (Naive, LinkCore):
-        team = rehearse(NodeSettings("link"), Faults(loss=0.3), build=sampled(core))
+        made = lambda part, _, core=core: Embodied(core(GradientFlow(), part))  # noqa: E731
+        team = Rehearsal(parts(), NodeSettings("link"), MemoryNetwork(Faults(loss=0.3)), core=made)
+        for agent, rate in {"a1": 10.0, "a2": 9.0, "a3": 11.0}.items():
+            team.start(agent, rate=rate)
         team.run(100.0)
         found[core] = off(team)
     assert found[Naive] > 0.02
@@ -306,7 +298,7 @@ def test_the_flow_sampled_naively_goes_to_the_wrong_place() -> None:
 def test_kept_rows_and_ends_are_found_by_name() -> None:
     """What an agent remembers of an end belongs to it, wherever it stands after the membership has changed."""
     with jax.enable_x64(True):
-        whole = LinkCore(parts()["a2"], 1.0, 1.0)
+        whole = LinkCore(GradientFlow(), parts()["a2"])
         less = whole.without({"a1"})
         state = whole.begin(whole.part.first)._replace(force=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
         assert whole.ends == [("a1", "a1"), ("a3", "a3")]

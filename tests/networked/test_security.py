@@ -28,7 +28,7 @@ from consat.cli import network as commands
 from consat.cli.keys import keys as keys_command
 from consat.errors import NetworkError
 from consat.network import keys
-from consat.network.names import spelled
+from consat.network.names import CA, CA_KEY, CERTIFICATE, KEY, spelled
 from consat.network.transports import zenoh as transport
 from consat.network.transports.zenoh import _key, _protection, _settings, _token, connect
 from tests.networked.loopback import SILENCE, delivered, endpoints, letter, team, until
@@ -148,7 +148,7 @@ def test_rogue_delivers_nothing(kind: str, home: Path, foreign: Path) -> None:
             }  # fmt: skip
         if kind == "foreign authority":
             # It trusts whoever it meets: a's certificate must not save a from it.
-            changes["transport/link/tls"] |= {"root_ca_certificate": str(home / keys.CA), "verify_name_on_connect": False}
+            changes["transport/link/tls"] |= {"root_ca_certificate": str(home / CA), "verify_name_on_connect": False}
         with rogue(listen, target, **changes) as session:
             if kind == "an agent that is no neighbour":
                 until(session.info.peers_zid)  # it belongs to the team: it may connect, and that is all
@@ -445,7 +445,7 @@ def test_addresses_that_cannot_be_are_refused(address: str, tmp_path: Path) -> N
 @given(st.text(min_size=1, max_size=30))
 def test_no_agents_folder_is_one_of_the_authoritys_files_or_elsewhere(name: str) -> None:
     folder = spelled(name)
-    assert folder not in {keys.CA, keys.CA_KEY, keys.KEY, keys.CERTIFICATE, ".", ".."}
+    assert folder not in {CA, CA_KEY, KEY, CERTIFICATE, ".", ".."}
     assert "/" not in folder
 
 

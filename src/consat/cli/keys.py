@@ -24,7 +24,8 @@ def keys(agents: tuple[str, ...], out: Path, addresses: tuple[str, ...], days: i
 
     That is a certificate authority, and a certificate for each agent: of a scenario, or of the IDs given.
     """
-    from consat.network.keys import CA_KEY, make
+    from consat.network.keys import make
+    from consat.network.names import CA_KEY
 
     ids = _ids(agents, overrides)
     make(ids, out, addresses=addresses, days=days, replace=replace)

@@ -312,8 +312,7 @@ def _keys(given: Path | None, file: str, agents: Any) -> Path | None:
         NetworkError: the folder beside FILE has no keys for one of the agents.
     """
     from consat.errors import NetworkError
-    from consat.network.keys import CA, KEY
-    from consat.network.names import spelled
+    from consat.network.names import CA, KEY, spelled
 
     if given is not None:
         return given

@@ -16,20 +16,21 @@ import secrets
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from consat.errors import NetworkError, shown
-from consat.network.names import spelled
+from consat.network.names import CA, CA_KEY, CERTIFICATE, KEY, spelled
 
-if TYPE_CHECKING:
+try:
     from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+except ImportError:
+    raise NetworkError("keys need the library cryptography, which is not installed; pip install 'consat[network]'") from None
 
-CA: Final = "ca.pem"
-CA_KEY: Final = "ca-key.pem"
-CERTIFICATE: Final = "certificate.pem"
-KEY: Final = "key.pem"
-"""File names. No agent's folder has such a name, because an encoded id has no dot."""
 LOOPBACK: Final = "127.0.0.1"
 DAYS: Final = 365
 """Validity of an agent's certificate, days."""
@@ -70,7 +71,6 @@ def make(
     Raises:
         NetworkError: no id is given, an agent has keys already, `days` or an address is invalid, or the authority cannot be used.
     """
-    _require_cryptography()
     if not ids:
         raise NetworkError("keys must be made for at least one agent; name the agents, or give a scenario")
     folders = {id_: directory / spelled(id_) for id_ in ids}
@@ -105,20 +105,19 @@ def load(directory: Path, id: str) -> Credentials:  # noqa: A002
     Raises:
         NetworkError: there are no keys, a check fails, or others can read the private key.
     """
-    _require_cryptography()
     folder = next((folder for folder in (directory / spelled(id), directory) if (folder / KEY).is_file()), None)
     if folder is None:
         raise NetworkError(f"there are no keys of agent {id!r} in {directory}; make some: consat keys {id} --out {directory}")
     found = Credentials(*(folder / name for name in (CA, CERTIFICATE, KEY)))
     if found.key.stat().st_mode & 0o077:
         raise NetworkError(f"{found.key} must be readable by its owner alone; chmod 600 {found.key}")
-    authority, certificate = _read(found.ca, _certificate), _read(found.certificate, _certificate)
+    authority, certificate = _read(found.ca, x509.load_pem_x509_certificate), _read(found.certificate, x509.load_pem_x509_certificate)
     _match(certificate, found.certificate, _read(found.key, _key), found.key)
     if (name := _common_name(certificate)) != spelled(id):
         raise NetworkError(f"{found.certificate} must be of agent {id!r}, but is of {shown(name)}")
     try:
         certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, _invalid_signature()):
+    except (ValueError, TypeError, InvalidSignature):
         raise NetworkError(f"{found.certificate} must be signed by the authority in {found.ca}, but is not") from None
     for path, each in ((found.ca, authority), (found.certificate, certificate)):
         _still_valid(each, path)
@@ -126,20 +125,11 @@ def load(directory: Path, id: str) -> Credentials:  # noqa: A002
 
 
 class _Pair(NamedTuple):
-    key: EllipticCurvePrivateKey
+    key: ec.EllipticCurvePrivateKey
     certificate: x509.Certificate
 
 
-def _require_cryptography() -> None:
-    try:
-        import cryptography  # noqa: F401
-    except ImportError:
-        raise NetworkError("keys need the library cryptography, which is not installed; pip install 'consat[network]'") from None
-
-
 def _alternatives(addresses: Iterable[str]) -> list[x509.GeneralName]:
-    from cryptography import x509
-
     names: list[x509.GeneralName] = []
     for address in dict.fromkeys(addresses):
         try:
@@ -151,10 +141,8 @@ def _alternatives(addresses: Iterable[str]) -> list[x509.GeneralName]:
     return names
 
 
-def _builder(subject: str, issuer: str, key: EllipticCurvePrivateKey, days: float, *, authority: bool) -> x509.CertificateBuilder:
+def _builder(subject: str, issuer: str, key: ec.EllipticCurvePrivateKey, days: float, *, authority: bool) -> x509.CertificateBuilder:
     """The fields that certificates of agents and of the authority have in common."""
-    from cryptography import x509
-
     now = datetime.datetime.now(datetime.UTC)
     usage = dict.fromkeys(
         ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only"), False
@@ -175,20 +163,12 @@ def _builder(subject: str, issuer: str, key: EllipticCurvePrivateKey, days: floa
 
 
 def _new_authority() -> _Pair:
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     key = ec.generate_private_key(ec.SECP256R1())
     name = f"consat authority {secrets.token_hex(4)}"
     return _Pair(key, _builder(name, name, key, AUTHORITY_DAYS, authority=True).sign(key, hashes.SHA256()))
 
 
 def _issue(id_: str, authority: _Pair, names: list[x509.GeneralName], days: float) -> _Pair:
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import ExtendedKeyUsageOID
-
     key = ec.generate_private_key(ec.SECP256R1())
     roles = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
     certificate = (
@@ -202,7 +182,7 @@ def _issue(id_: str, authority: _Pair, names: list[x509.GeneralName], days: floa
 
 
 def _read_authority(directory: Path) -> _Pair:
-    certificate, key = _read(directory / CA, _certificate), _read(directory / CA_KEY, _key)
+    certificate, key = _read(directory / CA, x509.load_pem_x509_certificate), _read(directory / CA_KEY, _key)
     _match(certificate, directory / CA, key, directory / CA_KEY)
     _still_valid(certificate, directory / CA)
     return _Pair(key, certificate)
@@ -217,27 +197,17 @@ def _read(path: Path, parse: Callable[[bytes], T]) -> T:
         raise NetworkError(f"{path} is not what `consat keys` writes: {error}") from None
 
 
-def _certificate(text: bytes) -> x509.Certificate:
-    from cryptography import x509
-
-    return x509.load_pem_x509_certificate(text)
-
-
-def _key(text: bytes) -> EllipticCurvePrivateKey:
-    from cryptography.exceptions import UnsupportedAlgorithm
-    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
+def _key(text: bytes) -> ec.EllipticCurvePrivateKey:
     try:
         key = load_pem_private_key(text, None)
     except UnsupportedAlgorithm as error:
         raise ValueError(str(error)) from None
-    if not isinstance(key, EllipticCurvePrivateKey):
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise TypeError("a private key on the curve P-256 is due")
     return key
 
 
-def _match(certificate: x509.Certificate, certificate_path: Path, key: EllipticCurvePrivateKey, key_path: Path) -> None:
+def _match(certificate: x509.Certificate, certificate_path: Path, key: ec.EllipticCurvePrivateKey, key_path: Path) -> None:
     if certificate.public_key() != key.public_key():
         raise NetworkError(f"{key_path} must be the key of {certificate_path}, but is another")
 
@@ -249,34 +219,20 @@ def _still_valid(certificate: x509.Certificate, path: Path) -> None:
         raise NetworkError(f"{path} is valid from {first} to {last} only, and by this machine's clock it is {now:%Y-%m-%d}")
 
 
-def _invalid_signature() -> type[Exception]:
-    from cryptography.exceptions import InvalidSignature
-
-    return InvalidSignature
-
-
 def _name(common: str) -> x509.Name:
-    from cryptography import x509
-
     return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common)])
 
 
 def _common_name(certificate: x509.Certificate) -> str:
-    from cryptography import x509
-
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
 def _pem(certificate: x509.Certificate) -> bytes:
-    from cryptography.hazmat.primitives.serialization import Encoding
-
     return certificate.public_bytes(Encoding.PEM)
 
 
-def _private_pem(key: EllipticCurvePrivateKey) -> bytes:
-    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
-
+def _private_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 

@@ -1,4 +1,4 @@
-"""Encoding of agents' ids, which may be any text, for key expressions, certificates and file names, which may not."""
+"""Names of key files, and the encoding of agents' ids, which may be any text, for key expressions, certificates and file names."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from urllib.parse import quote
 
 from consat.errors import NetworkError, shown
 
+CA: Final = "ca.pem"
+CA_KEY: Final = "ca-key.pem"
+CERTIFICATE: Final = "certificate.pem"
+KEY: Final = "key.pem"
+"""Names of key files. No agent's folder has such a name, because an encoded id has no dot."""
 LONGEST: Final = 64
 """Most characters of a certificate's common name (RFC 5280, ub-common-name)."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from consat.errors import AT_KEY, Fault, InvalidTeam, Place, closest, shown
 from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.structure import require_connected, with_link, without_link
 from consat.problem.team import Team
-from consat.scenario.document import Document, Node, decode, read
+from consat.scenario.document import Document, Node, read
 
 COMMANDS: Final[dict[str, tuple[str, ...]]] = {
     "change": ("agent", "constraint"), "leave": ("agent",), "join": ("agent",), "connect": ("agents",), "disconnect": ("agents",),
@@ -85,36 +84,18 @@ class Script(NamedTuple):
         return [self.begin, *(each.after for each in self.commands)]
 
 
-def no_commands(team: Team) -> Script:
-    """A script without commands."""
-    return Script(Stage(0.0, team, frozenset(team.ids)), ())
-
-
-def load_commands(file: Path, team: Team, mode: str, until: float | None) -> Script:
-    """Read a file of commands for a team.
+def read_commands(text: str, file: str, team: Team, mode: str, until: float | None = None) -> Script:
+    """Read the commands for a team. An empty text has none.
 
     Args:
-        file: path of the file, YAML or JSON lines.
+        text: YAML or JSON lines.
+        file: name of the file, for messages.
         team: all agents, with their constraints and links at the beginning.
         mode: communication mode of the agents.
         until: end of the launch, s; None if not known.
 
     Raises:
-        InvalidScenario: the file has faults. The message names every fault with its line and column.
-        OSError: the file cannot be read.
-    """
-    return read_commands(decode(file.read_bytes(), str(file)), str(file), team, mode, until)
-
-
-def read_commands(text: str, file: str, team: Team, mode: str, until: float | None = None) -> Script:
-    """As `load_commands`, from the text of a file.
-
-    Args:
-        text: YAML or JSON lines.
-        file: name of the file, for messages.
-        team: as in `load_commands`.
-        mode: as in `load_commands`.
-        until: as in `load_commands`.
+        InvalidScenario: the text has faults. The message names every fault with its line and column.
     """
     document = _document(text, file)
     entries = document.root.plain if document.root else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from consat.network.deploy.observer import AgentRecord, Observer
-from consat.network.node.station import REPORT
+from consat.network.node.modes import REPORT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,8 +32,6 @@ def board(title: str, *, quiet: bool) -> Iterator[Callable[[Observer, Mapping[st
     Yields:
         a function that redraws the table from the observer, whether each agent's process runs, and the time since the start, s.
     """
-    import sys
-
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
         return

@@ -112,7 +112,7 @@ class Fleet:
         child = _Child(process)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
-        self._selector.register(process.stdout, selectors.EVENT_READ, (agent, child))
+        self._selector.register(process.stdout, selectors.EVENT_READ, child)
         self._children[agent] = child
 
     def running(self, agent: str) -> bool:
@@ -122,7 +122,7 @@ class Fleet:
     def exit_code(self, agent: str) -> int | None:
         """The exit code of an agent's process. None if it was never started, and until it has ended and `poll` has read all its output."""
         child = self._children.get(agent)
-        if child is None or any(key.data[1] is child for key in self._selector.get_map().values()):
+        if child is None or any(key.data is child for key in self._selector.get_map().values()):
             return None
         return child.process.poll()
 
@@ -152,7 +152,7 @@ class Fleet:
         """The events that have arrived. Waits at most `timeout`, s, for the first one."""
         events: list[Event] = []
         for key, _ in self._selector.select(timeout):
-            _, child = key.data
+            child = key.data
             assert child.process.stdout is not None
             data = child.process.stdout.read1(LARGEST_READ)
             if not data:
@@ -200,9 +200,7 @@ def free_ports(count: int) -> list[int]:
         NetworkError: there are not enough free ports.
     """
     found: list[int] = []
-    candidates = list(range(*PORTS))
-    random.shuffle(candidates)
-    for port in candidates:
+    for port in random.sample(range(*PORTS), PORTS[1] - PORTS[0]):
         if len(found) == count:
             return found
         with socket.socket() as probe:

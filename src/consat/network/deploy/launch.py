@@ -13,7 +13,7 @@ import numpy as np
 
 from consat.engine.rules import HOLD, SETTLED
 from consat.faults import Faults
-from consat.network.deploy.commands import load_commands, no_commands
+from consat.network.deploy.commands import read_commands
 from consat.network.deploy.dashboard import board
 from consat.network.deploy.fleet import Fleet, free_ports
 from consat.network.deploy.observer import Observer
@@ -31,6 +31,7 @@ from consat.results.trace import Ending
 from consat.runs.preparation import copies_of, default_protocol, told
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, dump
+from consat.scenario.document import decode
 from consat.settings import Sends, Settings, Stop
 
 PATIENCE: Final = 600.0
@@ -123,13 +124,14 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
     team = scenario.team
     settings = _settings(team, scenario.settings, plan.mode)
     scenario = replace(scenario, settings=settings)
-    script = no_commands(team) if plan.commands is None else load_commands(plan.commands, team, plan.mode, plan.until)
+    text = "" if plan.commands is None else decode(plan.commands.read_bytes(), str(plan.commands))
+    script = read_commands(text, str(plan.commands), team, plan.mode, plan.until)
     ports = free_ports(team.count)
     addresses = {agent: f"tcp/127.0.0.1:{port}" for agent, port in zip(team.ids, ports, strict=True)}
     absent = frozenset(team.ids) - script.begin.present
     parts = split(scenario, run=f"launch-{uuid.uuid4().hex[:12]}", addresses=addresses, absent=absent)
     size = scale(team)
-    starts = np.array([part.first[part.team.ids.index(agent)] for agent, part in parts.items()])
+    starts = np.array([part.first[part.own] for part in parts.values()])
     observer = Observer(team, starts, "round" if plan.mode == "lockstep" else "time")
     began = time.monotonic()
     with Fleet(parts, plan.options(), exact=plan.mode == "lockstep") as fleet:
@@ -233,7 +235,7 @@ def _ending(supervisor: Supervisor, rules: _Rules) -> Ending | None:
     observer, stop, earliest = supervisor.observer, supervisor.plan.ending, supervisor.earliest
     if stop == "never":
         return None
-    latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in observer.present_records)
+    latest = observer.latest
     known, since = observer.all_known()[0], observer.concluded()
     since = None if since is None else max(since, earliest)
     if (stop == "satisfied" or known == "infeasible") and since is not None and latest - since >= rules.window:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import jax
 import numpy as np
@@ -121,7 +121,7 @@ class Observer:
         records: the events of each agent, by id.
     """
 
-    def __init__(self, team: Team, start: np.ndarray, clock: str) -> None:
+    def __init__(self, team: Team, start: np.ndarray, clock: Literal["round", "time"]) -> None:
         self.team, self.clock, self.present = team, clock, frozenset(team.ids)
         self.origin: float | None = None
         self.records = {agent: AgentRecord() for agent in team.ids}
@@ -154,6 +154,11 @@ class Observer:
         since = [record.settled_from for record in self.present_records]
         return None if None in since else max(stamp for stamp in since if stamp is not None)
 
+    @property
+    def latest(self) -> float:
+        """The stamp up to which the positions of all agents are known; −∞ while one is unknown."""
+        return min(record.stamps[-1] if record.stamps else -np.inf for record in self.present_records)
+
     def settled(self, window: float, distance: float) -> bool:
         """Whether the team has converged: all agents hear all their neighbours, and none has moved.
 
@@ -163,8 +168,7 @@ class Observer:
         """
         if any(record.report is None or not all(peer["up"] for peer in record.report["peers"].values()) for record in self.present_records):
             return False
-        latest = min((record.stamps[-1] if record.stamps else -np.inf) for record in self.present_records)
-        return all(record.moved(latest - window) <= distance for record in self.present_records)
+        return all(record.moved(self.latest - window) <= distance for record in self.present_records)
 
     def positions(self) -> np.ndarray:
         """(N, d) current positions of the bodies, length."""
@@ -221,7 +225,7 @@ class Observer:
         still = len(stages) == 1 and not final.moves
         margin, position = margins.min(axis=1), position[:, there]
         return Trace(
-            clock="round" if self.clock == "round" else "time",
+            clock=self.clock,
             steps=steps if self.clock == "time" else steps.astype(int),
             position=position,
             velocity=np.diff(position, axis=0, append=position[-1:]) / dt,

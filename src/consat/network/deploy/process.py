@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -27,13 +26,16 @@ from consat.errors import InvalidInput, InvalidSettings, InvalidTeam
 from consat.faults import Faults
 from consat.network.deploy.output import Output
 from consat.network.node.body import Body, MeasuredBody, SimulatedBody
+from consat.network.node.build import core_of, runner_of
 from consat.network.node.commander import Commander
-from consat.network.node.core import Embodied, Moment
+from consat.network.node.core import Moment
+from consat.network.node.embodied import Embodied
 from consat.network.node.membership import Membership
-from consat.network.node.modes import NodeSettings, Runner, core_of, runner_of
+from consat.network.node.modes import NodeSettings
 from consat.network.node.orders import Order, Orders, heeding_signals
 from consat.network.node.part import Part
 from consat.network.node.pilot import RobotBody
+from consat.network.node.runner import Runner
 from consat.network.node.station import Station
 from consat.network.transports import Transport
 from consat.network.transports.faults import FaultyTransport
@@ -120,117 +122,145 @@ def run_agent(part: Part, settings: NodeSettings, options: ProcessOptions, rerea
         commander = Commander(part.me, dimension, measured, options.sensor_timeout, output.write)
         core = core_of(part, settings)
         _compile(core)
-        begin = Restart(part, core, Membership(part))
-        outcome = _wait_to_join(begin, orders, reread, output.write) if options.standby else begin
-        end = math.inf if options.until is None else time.monotonic() + options.until
         try:
-            with ThreadPoolExecutor(1) as reader:
-                kept = _Kept(body, orders, commander, reread, reader, deque(), end, output.write)
-                while isinstance(outcome, Restart):
-                    outcome = _run_part(outcome, settings, options, kept)
+            _Process(settings, options, body, orders, commander, reread, output.write).run(Restart(part, core, Membership(part)))
         except BaseException:
             commander.halt()
             raise
 
 
-class _Kept(NamedTuple):
-    """Objects that are kept when the part is reloaded.
+@dataclass
+class _Process:
+    """What an agent keeps when its part is reloaded, and the loop that runs it.
 
     Attributes:
+        settings: mode and rate of the agent.
+        options: options of the process.
         body: the body of the agent.
         orders: orders and measurements from stdin.
         commander: sends velocity commands to the body.
         reread: reads the part from its file; None if the part has no file.
-        reader: thread that reads and compiles a new part.
-        reading: the reload order in progress, with its future result; at most one.
-        end: time on the monotonic clock at which the process ends, s.
         write: writes an event.
+        end: time on the monotonic clock at which the process ends, s.
+        reading: the reload order in progress, with its future result.
     """
 
+    settings: NodeSettings
+    options: ProcessOptions
     body: Body
     orders: Orders
     commander: Commander
     reread: Callable[[], Part] | None
-    reader: Executor
-    reading: deque[tuple[Order, Future[tuple[Part, Embodied] | str]]]
-    end: float
     write: Callable[[dict[str, Any]], None]
+    end: float = math.inf
+    reading: tuple[Order, Future[tuple[Part, Embodied] | str]] | None = None
 
+    def run(self, begin: Restart) -> None:
+        """Run the agent, with one part after the other, until it ends."""
+        outcome = self._wait_to_join(begin) if self.options.standby else begin
+        if self.options.until is not None:
+            self.end = time.monotonic() + self.options.until
+        with ThreadPoolExecutor(1) as reader:
+            while isinstance(outcome, Restart):
+                outcome = self._run_part(outcome, reader)
 
-def _run_part(begin: Restart, settings: NodeSettings, options: ProcessOptions, kept: _Kept) -> Restart | str:
-    """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
-    part = begin.part
-    with _transport(part, settings, options) as transport:
-        runner = runner_of(
-            part, settings, transport, clock=time.monotonic, incarnation=time.time_ns() // 1_000_000, body=kept.body, log=kept.write,
-            core=begin.core,
-        )  # fmt: skip
-        station = runner.station
-        station.membership.adopt(begin.membership)
-        station.log("start", mode=settings.mode, run=part.run, pid=os.getpid(), rounds=settings.mode == "lockstep")
-        try:
-            outcome = _loop(runner, transport, kept, options)
-        except BaseException:
-            kept.commander.halt()  # before the transport is closed, which may take long
-            raise
-        if isinstance(outcome, str):
-            kept.commander.halt()
-            station.send_goodbye()
-        station.report()
-        if isinstance(outcome, str):
-            station.log("end", why=outcome, cpu=round(time.process_time(), 3))
-        return outcome
+    def _wait_to_join(self, begin: Restart) -> Restart | str:
+        """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
+        part, core, orders = begin.part, begin.core, self.orders
 
+        def write(event: str, **details: Any) -> None:
+            self.write({"event": event, "id": part.me, "t": time.monotonic(), **details})
 
-def _loop(runner: Runner, transport: Transport, kept: _Kept, options: ProcessOptions) -> Restart | str:
-    station, orders, commander = runner.station, kept.orders, kept.commander
-    known_since = math.inf
-    while True:
-        commander.sense(orders)
-        due = runner.step()
-        now = time.monotonic()
-        commander.sense(orders)  # measurements that arrived during the step
-        commander.steer(station.target)
-        if (restart := _execute_orders(runner, kept)) is not None:
-            return restart
-        known_since = min(known_since, now) if station.settled else math.inf
-        if runner.done:
-            return "done"
-        if orders.stopped:
-            return orders.stopped
-        if now >= kept.end:
-            return "out of time"
-        if options.stop == "satisfied" and now - known_since >= LINGER:
-            return str(station.known)
-        transport.wait(min(max(due - now, 0.0), NAP))
+        write("standby", pid=os.getpid())
+        while not orders.stopped and not orders.leaving:
+            for line, why in orders.rejected():
+                write("rejected", line=line, why=why)
+            while (order := orders.next()) is not None:
+                outcome: Any = "the agent has not joined yet"
+                if order.command == "join":
+                    return Restart(part, core, Membership(part))
+                if order.command == "clock":
+                    outcome, part = None, replace(part, epoch=float(order.given["epoch"]))
+                elif order.command == "reload":
+                    outcome = _reloaded(part, core, self.reread)
+                if isinstance(outcome, tuple):
+                    part, core = replace(outcome[0], epoch=outcome[0].epoch or part.epoch), outcome[1]
+                elif outcome is not None:
+                    write("rejected", line=order.line, why=outcome)
+            time.sleep(NAP)
+        why = orders.stopped or "told to leave"
+        write("end", why=why, cpu=round(time.process_time(), 3))
+        return why
 
+    def _run_part(self, begin: Restart, reader: Executor) -> Restart | str:
+        """Run with one part. Returns the state to continue with after a reload, or the reason of the end."""
+        part, settings = begin.part, self.settings
+        with _transport(part, settings, self.options) as transport:
+            incarnation = time.time_ns() // 1_000_000
+            station = Station(
+                part, begin.core, settings, transport, clock=time.monotonic, incarnation=incarnation, body=self.body, log=self.write
+            )
+            station.membership.adopt(begin.membership)
+            station.log("start", mode=settings.mode, run=part.run, pid=os.getpid(), rounds=settings.mode == "lockstep")
+            try:
+                outcome = self._loop(runner_of(station), transport, reader)
+            except BaseException:
+                self.commander.halt()  # before the transport is closed, which may take long
+                raise
+            if isinstance(outcome, str):
+                self.commander.halt()
+                station.send_goodbye()
+            station.report()
+            if isinstance(outcome, str):
+                station.log("end", why=outcome, cpu=round(time.process_time(), 3))
+            return outcome
 
-def _execute_orders(runner: Runner, kept: _Kept) -> Restart | None:
-    """Carry out the orders from stdin and log those that are rejected. Returns the state to continue with once a reload is done.
+    def _loop(self, runner: Runner, transport: Transport, reader: Executor) -> Restart | str:
+        station, orders, commander = runner.station, self.orders, self.commander
+        known_since = math.inf
+        while True:
+            commander.sense(orders)
+            due = runner.step()
+            now = time.monotonic()
+            commander.sense(orders)  # measurements that arrived during the step
+            commander.steer(station.target)
+            if (restart := self._execute_orders(runner, reader)) is not None:
+                return restart
+            known_since = min(known_since, now) if station.settled else math.inf
+            if runner.done:
+                return "done"
+            if orders.stopped:
+                return orders.stopped
+            if now >= self.end:
+                return "out of time"
+            if self.options.stop == "satisfied" and now - known_since >= LINGER:
+                return str(station.known)
+            transport.wait(min(max(due - now, 0.0), NAP))
 
-    A new part is read and compiled in a separate thread. Meanwhile the agent continues as before, and later orders wait.
-    """
-    station, orders = runner.station, kept.orders
-    for line, why in orders.rejected():
-        station.log("rejected", line=line, why=why)
-    while not kept.reading:
-        if (order := orders.next()) is None:
-            break
-        if order.command == "reload":
-            kept.reading.append((order, kept.reader.submit(_reloaded, station.part, station.core, kept.reread)))
-        elif (refusal := _execute(runner, order)) is not None:
-            station.log("rejected", line=order.line, why=refusal)
-    if orders.leaving:
-        orders.leaving = False
-        kept.commander.halt()
-        station.log("leaving")
-        runner.leave()
-    if kept.reading and kept.reading[0][1].done():
-        order, found = kept.reading.popleft()
-        if isinstance(outcome := found.result(), tuple):
-            return _restart(station, *outcome)
-        station.log("rejected", line=order.line, why=outcome)
-    return None
+    def _execute_orders(self, runner: Runner, reader: Executor) -> Restart | None:
+        """Carry out the orders from stdin and log those that are rejected. Returns the state to continue with once a reload is done.
+
+        A new part is read and compiled in a separate thread. Meanwhile the agent continues as before, and later orders wait.
+        """
+        station, orders = runner.station, self.orders
+        for line, why in orders.rejected():
+            station.log("rejected", line=line, why=why)
+        while self.reading is None and (order := orders.next()) is not None:
+            if order.command == "reload":
+                self.reading = order, reader.submit(_reloaded, station.part, station.core, self.reread)
+            elif (refusal := _execute(runner, order)) is not None:
+                station.log("rejected", line=order.line, why=refusal)
+        if orders.leaving:
+            orders.leaving = False
+            self.commander.halt()
+            station.log("leaving")
+            runner.leave()
+        if self.reading is not None and self.reading[1].done():
+            (order, found), self.reading = self.reading, None
+            if isinstance(outcome := found.result(), tuple):
+                return _restart(station, *outcome)
+            station.log("rejected", line=order.line, why=outcome)
+        return None
 
 
 def _restart(station: Station, part: Part, core: Embodied) -> Restart:
@@ -284,37 +314,6 @@ def _execute(runner: Runner, order: Order) -> str | None:
     return None
 
 
-def _wait_to_join(
-    begin: Restart, orders: Orders, reread: Callable[[], Part] | None, out: Callable[[dict[str, Any]], None]
-) -> Restart | str:  # fmt: skip
-    """Wait for the order ``join``. Returns the state to begin with, or the reason why the process must end."""
-    part, core = begin.part, begin.core
-
-    def write(event: str, **details: Any) -> None:
-        out({"event": event, "id": part.me, "t": time.monotonic(), **details})
-
-    write("standby", pid=os.getpid())
-    while not orders.stopped and not orders.leaving:
-        for line, why in orders.rejected():
-            write("rejected", line=line, why=why)
-        while (order := orders.next()) is not None:
-            outcome: Any = "the agent has not joined yet"
-            if order.command == "join":
-                return Restart(part, core, Membership(part))
-            if order.command == "clock":
-                outcome, part = None, replace(part, epoch=float(order.given["epoch"]))
-            elif order.command == "reload":
-                outcome = _reloaded(part, core, reread)
-            if isinstance(outcome, tuple):
-                part, core = replace(outcome[0], epoch=outcome[0].epoch or part.epoch), outcome[1]
-            elif outcome is not None:
-                write("rejected", line=order.line, why=outcome)
-        time.sleep(NAP)
-    why = orders.stopped or "told to leave"
-    write("end", why=why, cpu=round(time.process_time(), 3))
-    return why
-
-
 def _compile(core: Embodied) -> None:
     """Compile the core by running one turn, so that no neighbour waits for the compilation later."""
     moment = Moment(0.0, 1.0, np.zeros(len(core.ends)), np.ones(len(core.ends), dtype=bool), np.zeros(core.part.team.dimension))
@@ -333,15 +332,18 @@ def _measured(part: Part, options: ProcessOptions) -> MeasuredBody:
 
 
 def _start(part: Part, options: ProcessOptions) -> np.ndarray:
-    return part.first[part.team.ids.index(part.me)] if options.position is None else np.array(options.position, dtype=float)
+    return part.first[part.own] if options.position is None else np.array(options.position, dtype=float)
 
 
 @contextmanager
 def _transport(part: Part, settings: NodeSettings, options: ProcessOptions) -> Iterator[Transport]:
-    from consat.network import keys
     from consat.network.transports.zenoh import connect
 
-    credentials = None if options.keys is None else keys.load(options.keys, part.me)
+    credentials = None
+    if options.keys is not None:
+        from consat.network.keys import load
+
+        credentials = load(options.keys, part.me)
     listen, *others = (_protected(address) if credentials else address for address in (part.listen, *(n.address for n in part.neighbours)))
     addresses = {neighbour.id: address for neighbour, address in zip(part.neighbours, others, strict=True)}
     transport = connect(part.run, part.me, listen, addresses, reliable=settings.reliable, credentials=credentials)

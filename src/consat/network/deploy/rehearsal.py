@@ -7,14 +7,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
 from consat.network.node.body import SimulatedBody
-from consat.network.node.modes import NodeSettings, Runner, runner_of
+from consat.network.node.build import core_of, runner_of
+from consat.network.node.embodied import Embodied
+from consat.network.node.modes import NodeSettings
 from consat.network.node.part import Part
+from consat.network.node.runner import Runner
+from consat.network.node.station import Station
 from consat.network.transports.memory import MemoryNetwork
 
 OPENING = 0.01
@@ -31,7 +36,7 @@ class Rehearsal:
         settings: mode and rate of the agents.
         network: the simulated network.
         speed: largest speed of a body, length/s.
-        build: makes the runner of an agent; by default as a process does.
+        core: makes the core of an agent; by default as a process does.
         skew: by how much the Unix time of an agent is ahead of the time of the network, s, by id; 0 for agents that are not listed.
     """
 
@@ -42,15 +47,15 @@ class Rehearsal:
         network: MemoryNetwork,
         *,
         speed: float = np.inf,
-        build: Callable[..., Runner] = runner_of,
+        core: Callable[[Part, NodeSettings], Embodied] = core_of,
         skew: Mapping[str, float] | None = None,
     ) -> None:
         self.parts, self.settings, self.network = parts, settings, network
         self.events: list[dict[str, Any]] = []
-        self.bodies = {agent: SimulatedBody(part.first[part.team.ids.index(agent)], speed) for agent, part in parts.items()}
+        self.bodies = {agent: SimulatedBody(part.first[part.own], speed) for agent, part in parts.items()}
         self.runners: dict[str, Runner] = {}
         self._skew = skew or {}
-        self._build, self._incarnations = build, dict.fromkeys(parts, 0)
+        self._core, self._incarnations = core, dict.fromkeys(parts, 0)
         self._due: dict[str, float] = {}
 
     def start(self, *agents: str, **changes: Any) -> None:
@@ -61,19 +66,19 @@ class Rehearsal:
             **changes: fields of `NodeSettings` to change for these agents.
         """
         for agent in agents or tuple(self.parts):
-            part = self.parts[agent]
+            part, settings = self.parts[agent], replace(self.settings, **changes)
             self._incarnations[agent] += 1
-            settings = NodeSettings(**({field: getattr(self.settings, field) for field in self.settings.__dataclass_fields__} | changes))
+            endpoint = self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours])
             with jax.enable_x64(True):
-                self.runners[agent] = self._build(
-                    part, settings, self.network.endpoint(agent, [neighbour.id for neighbour in part.neighbours]),
-                    clock=self.network.clock, incarnation=self._incarnations[agent], body=self.bodies[agent], log=self.events.append,
-                    wall=functools.partial(self._wall, self._skew.get(agent, 0.0)),
+                station = Station(
+                    part, self._core(part, settings), settings, endpoint, clock=self.network.clock, incarnation=self._incarnations[agent],
+                    body=self.bodies[agent], log=self.events.append, wall=functools.partial(self._wall, agent),
                 )  # fmt: skip
+                self.runners[agent] = runner_of(station)
             self._due[agent] = self.network.now + OPENING
 
-    def _wall(self, skew: float) -> float:
-        return self.network.now + skew
+    def _wall(self, agent: str) -> float:
+        return self.network.now + self._skew.get(agent, 0.0)
 
     def kill(self, *agents: str) -> None:
         """End agents without notice, as a crash does."""
@@ -98,19 +103,13 @@ class Rehearsal:
                 ready = self.network.deliver() & self.runners.keys()
                 ready |= {agent for agent, due in self._due.items() if due <= self.network.now}
                 for agent in sorted(ready):
-                    self._step(agent)
+                    self._due[agent] = max(self.runners[agent].step(), self.network.now + SHORTEST)
+                    if self.runners[agent].done:
+                        self.kill(agent)
                 if until():
                     return True
         self.network.now = end
         return until()
-
-    def _step(self, agent: str) -> None:
-        runner = self.runners[agent]
-        due = runner.step()
-        if runner.done:
-            self.kill(agent)
-            return
-        self._due[agent] = max(due, self.network.now + SHORTEST)
 
     def positions(self) -> dict[str, np.ndarray]:
         """The current position of each body, (d,), by id."""

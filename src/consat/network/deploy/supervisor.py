@@ -143,10 +143,10 @@ class Supervisor:
         """The agents whose process has ended without being told to, with the exit codes."""
         ended = []
         for agent, record in self.observer.records.items():
-            told = agent not in self.stage.present and agent not in self._standby
+            dismissed = agent not in self.stage.present and agent not in self._standby
             done = self.plan.rounds is not None and record.ended is not None and record.ended["why"] == "done"
             code = self.fleet.exit_code(agent)
-            if code is not None and (code > 0 or not (told or done)):
+            if code is not None and (code > 0 or not (dismissed or done)):
                 ended.append((agent, code))
         return ended
 

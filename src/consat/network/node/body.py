@@ -10,6 +10,8 @@ SLACK: Final = 0.5
 """Additional travel time, s, in the plausibility check: a measurement is accepted up to speed × (elapsed time + `SLACK`) from the last."""
 VALID: Final = 0.5
 """Validity of a command, s. A robot that has received no other command by then must stop."""
+LAG: Final = 0.5
+"""Time constant of the motion towards a target, s: the commanded velocity is distance/`LAG`, up to the largest speed."""
 CONFIRMED: Final = 5
 """Number of consecutive measurements, consistent with each other but not with the last good one, that are accepted: the body was moved."""
 
@@ -96,13 +98,12 @@ class MeasuredBody:
     Args:
         speed: largest commanded speed, length/s. If infinite, any distance is plausible.
         timeout: time without a measurement, s, after which the position counts as unknown, and the body is commanded to stop.
-        lag: time constant of the motion towards the target, s: the commanded velocity is distance/`lag`, limited to `speed`.
     """
 
     valid = VALID
 
-    def __init__(self, speed: float = np.inf, timeout: float = np.inf, lag: float = 0.5) -> None:
-        self._speed, self._timeout, self._lag = speed, timeout, lag
+    def __init__(self, speed: float = np.inf, timeout: float = np.inf) -> None:
+        self._speed, self._timeout = speed, timeout
         self._good: Measurement | None = None
         self._rival: Measurement | None = None
         self._agreeing = 0
@@ -145,7 +146,7 @@ class MeasuredBody:
     def follow(self, target: np.ndarray, now: float) -> np.ndarray:
         if self._good is None or not self.sensed(now):
             return np.zeros_like(target)
-        return limited((target - self._good.position) / self._lag, self._speed)
+        return limited((target - self._good.position) / LAG, self._speed)
 
 
 def _turns_back(last: Measurement, new: Measurement) -> bool:

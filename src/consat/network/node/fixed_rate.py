@@ -13,43 +13,25 @@ from typing import Any, Final
 import numpy as np
 
 from consat.network.node.core import Moment
-from consat.network.node.station import Station
+from consat.network.node.runner import Runner
+from consat.network.node.station import SILENT, Station
 from consat.network.wire import Kind
 
 PATIENCE: Final = 3.0
 """Largest waiting time for further neighbours after the first one was heard, s."""
 GREETING: Final = 0.05
 """Time between greetings, s."""
-FAREWELLS: Final = 30
-"""Number of messages in which a leaving agent announces it: enough under heavy message loss."""
 
 
-class FixedRate:
-    """Runner of one agent with a fixed rate.
+class FixedRate(Runner):
+    """Runner of one agent with a fixed rate."""
 
-    Args:
-        station: the agent's station.
-        rate: steps per second, Hz.
-        turns: number of steps; None for no end.
-        stale: time without a message, s, after which a neighbour does not count as fresh; at least 3 periods.
-    """
-
-    def __init__(self, station: Station, rate: float, turns: int | None = None, stale: float = 0.5) -> None:
-        self.station = station
-        self.done = False
-        self._period, self._turns, self._stale = 1.0 / rate, turns, max(stale, 3.0 / rate)
+    def __init__(self, station: Station) -> None:
+        super().__init__(station)
+        self._period = station.settings.period
         self._latest: dict[str, Sequence[np.ndarray]] = {}
-        self._state: Any = None
-        self._count = self._regrouped = 0
         self._due = self._last = station.clock()
-        self._begun = False
         self._first_heard: float | None = None
-        self._farewells = 0
-
-    def leave(self) -> None:
-        """Leave for good: announce it in `FAREWELLS` messages, then be done."""
-        self.station.membership.drop(self.station.part.me)
-        self._farewells = FAREWELLS
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
         """See `Runner.change` and `Station.change`."""
@@ -65,8 +47,9 @@ class FixedRate:
         if now < self._due:
             return self._due
         if self._farewells:
-            self._farewell()
-        elif self._begun or self._ready(now):
+            self._due += self._period
+            self._say_farewell()
+        elif self._state is not None or self._ready(now):
             self._due = max(self._due + self._period, now)
             self._turn(now)
         else:
@@ -75,45 +58,37 @@ class FixedRate:
         station.watch()
         return self._due
 
-    def _farewell(self) -> None:
-        self._due += self._period
-        self._farewells -= 1
-        self.done = self._farewells == 0
-        self.station.send_hello()
-
     def _ready(self, now: float) -> bool:
+        """Whether the agent can begin; then it has a state."""
         station = self.station
         if station.body.position() is None or not station.timed:
             return False
         heard = [np.isfinite(station.peers.all[neighbour].heard) for neighbour in station.present]
         if any(heard) and self._first_heard is None:
             self._first_heard = now
-        late = self._first_heard is not None and now - self._first_heard > PATIENCE
-        self._begun = all(heard) or late
-        if self._begun:
-            self._due = self._last = now
-            self._state = station.core.begin(station.present_rows(station.first()), station.now())
-        return self._begun
+        if not (all(heard) or (self._first_heard is not None and now - self._first_heard > PATIENCE)):
+            return False
+        self._due = self._last = now
+        self._state = station.core.begin(station.first(), station.now())
+        return True
 
     def _turn(self, now: float) -> None:
         station = self.station
         if station.changed:
-            self._state = station.regroup(self._state, station.first())
-            self._regrouped = self._count
+            self._state = station.regroup(self._state)
+            self._regrouped = self._round
         self._state = station.check_restarts(self._state)
         inbox, arrived = station.core.empty()
         for neighbour, arrays in self._latest.items():
-            station.deliver(neighbour, arrays, inbox, arrived)
+            station.codec.decode(neighbour, arrays, inbox, arrived)
         self._latest.clear()
-        moment = Moment(
-            float(self._count - self._regrouped), now - self._last, station.delays(), station.fresh(self._stale), station.place(),
-            time=station.now(),
-        )  # fmt: skip
+        fresh = station.fresh(max(SILENT, 3.0 * self._period))
+        number, elapsed = float(self._round - self._regrouped), now - self._last
+        moment = Moment(number, elapsed, station.delays(), fresh, station.place(), time=station.now())
         self._state, outbox, view = station.turn(self._state, inbox, arrived, moment)
         self._last = now
-        self._count += 1
+        self._round += 1
         outbox, listeners = station.filter(outbox)
-        station.send(station.blocks(outbox), among=listeners)
+        station.send(station.codec.encode(outbox), listeners)
         station.move(view, now)
-        if self._turns is not None and self._count >= self._turns:
-            self.done = True
+        self.done = station.settings.turns is not None and self._round >= station.settings.turns

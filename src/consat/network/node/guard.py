@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from consat.network.node.core import AgentView, Embodied, Moment, Rows
+from consat.network.node.core import Moment, Rows
+from consat.network.node.embodied import AgentView, Embodied
 
 
 class Turn(NamedTuple):
@@ -41,8 +42,7 @@ def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment)
         return whole
     kept, refused = set[str](), []
     for neighbour in (each.id for each in core.part.neighbours):
-        its = _of(core, arrived, {neighbour})
-        if not (its.link.any() or its.pair.any()):
+        if not any(mask.any() for mask in _only(core, inbox, arrived, {neighbour})[1]):
             continue
         if _sound(state, Turn(*core.turn(state, *_only(core, inbox, arrived, kept | {neighbour}), moment))):
             kept.add(neighbour)
@@ -55,15 +55,11 @@ def turn(core: Embodied, state: Any, inbox: Rows, arrived: Rows, moment: Moment)
     return Turn(*core.turn(fresh, *_only(core, inbox, arrived, set()), moment), refused=tuple(refused), restarted=True)
 
 
-def _of(core: Embodied, arrived: Rows, neighbours: Collection[str]) -> Rows:
-    """The mask `arrived`, restricted to some neighbours."""
-    link = np.array([other in neighbours for other, _ in core.ends], dtype=bool)
-    return Rows(arrived.link & link, arrived.pair & np.array([each.id in neighbours for each in core.part.neighbours], dtype=bool))
-
-
 def _only(core: Embodied, inbox: Rows, arrived: Rows, neighbours: Collection[str]) -> tuple[Rows, Rows]:
     """Inbox and mask of arrival, restricted to the messages of some neighbours."""
-    kept = _of(core, arrived, neighbours)
+    link = np.array([other in neighbours for other, _ in core.ends], dtype=bool)
+    pair = np.array([each.id in neighbours for each in core.part.neighbours], dtype=bool)
+    kept = Rows(arrived.link & link, arrived.pair & pair)
     return Rows(*(np.where(there[:, None], numbers, 0.0) for numbers, there in zip(inbox, kept, strict=True))), kept
 
 

@@ -17,19 +17,18 @@ an agent that has lost its state takes over from its neighbours.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.network.node.core import LARGEST, Core, IndexMap, Moment, Rows, StepResult, no_pair_numbers
+from consat.network.node.core import LARGEST, Core, IndexMap, Moment, Rows, StepResult
 from consat.network.node.part import Part
-from consat.network.node.problem import OwnSolver, ends
-from consat.numerics import quick_compilation
+from consat.network.node.problem import OwnSolver
+from consat.numerics import quickly_compiled
+from consat.protocols import GradientFlow
 from consat.protocols.local.proximal import Memory
 
 AGREE = 0.05
@@ -60,64 +59,41 @@ class LinkState(NamedTuple):
     memory: Memory
 
 
-_PER: Mapping[str, Any] = {
-    "x": "row", "force": "link", "there": "link", "theirs": "link", "valid": "link", "adopted": "link", "memory": "agent",
-}  # fmt: skip
+class LinkCore(Core):
+    """See the module. A row for an end of a link is x_i, λ_ij, and whether this is valid."""
 
-
-class LinkCore:
-    """`consat.network.node.core.Core` of the flow; see the module.
-
-    Args:
-        whole: the agent's part, with all agents.
-        k1: gain on the gradient, 1/s.
-        k2: gain on the disagreement, 1/s.
-        gone: agents that are absent.
-    """
-
-    def __init__(self, whole: Part, k1: float, k2: float, gone: Collection[str] = ()) -> None:
-        self.whole, self.k1, self.k2 = whole, k1, k2
-        self.part = whole.without(gone)
-        self.ends = ends(self.part)
-        self.solver = OwnSolver.of(self.part)
+    def __init__(self, protocol: GradientFlow, whole: Part, gone: Collection[str] = ()) -> None:
+        super().__init__(protocol, whole, gone)
         self.width = 2 * self.part.team.dimension + 1
         self.largest = np.full(self.width, LARGEST)
-        self.pair_numbers = no_pair_numbers(whole)
-        self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> LinkState:
-        return self._begin(self.solver, first, time)
+        return _begin(self.solver, first, time)
 
     def turn(self, state: LinkState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
-        gains = jnp.asarray(self.k1), jnp.asarray(self.k2)
-        state, outbox = self._turn(self.solver, gains, state, inbox.link, arrived.link, moment)
+        gains = jnp.asarray(self.protocol.k1), jnp.asarray(self.protocol.k2)
+        state, outbox = _turn(self.solver, gains, state, inbox.link, arrived.link, moment)
         return StepResult(state, Rows(np.asarray(outbox), inbox.pair), np.asarray(state.x))
-
-    def without(self, gone: Collection[str], whole: Part | None = None) -> LinkCore:
-        return LinkCore(whole or self.whole, self.k1, self.k2, gone)
-
-    def without_proofs(self, state: LinkState) -> LinkState:
-        """The state unchanged: it contains no proofs."""
-        return state
 
     def carry(self, other: Core, state: LinkState, first: np.ndarray, time: float = 0.0) -> LinkState:
         """Initial state with the old values at the ends of links that remain."""
-        return IndexMap.of(self, other).merge(_PER, state, self.begin(first, time))
+        index, fresh = IndexMap.of(self, other), self.begin(first, time)
+        ends = {name: index.links(getattr(state, name), getattr(fresh, name)) for name in ("force", "there", "theirs", "valid", "adopted")}
+        return LinkState(index.rows(state.x, first), **ends, memory=state.memory)
 
 
-def _begin(solver: OwnSolver, first: Array, time: Array) -> LinkState:
+@quickly_compiled()
+def _begin(solver: OwnSolver, first: Any, time: Any) -> LinkState:
     solver = solver.at(time)
     there = solver.links.at(first)
     nothing = jnp.zeros(len(there))
-    kappa = jnp.ones(len(first))
-    return LinkState(
-        first, jnp.zeros_like(there), there, jnp.zeros_like(there), nothing, nothing,
-        solver.recall(first, kappa),
-    )  # fmt: skip
+    memory = solver.recall(first, jnp.ones(len(first)))
+    return LinkState(first, jnp.zeros_like(there), there, jnp.zeros_like(there), nothing, nothing, memory)
 
 
+@quickly_compiled()
 def _turn(
-    solver: OwnSolver, gains: tuple[Array, Array], state: LinkState, inbox: Array, arrived: Array, moment: Moment
+    solver: OwnSolver, gains: tuple[Array, Array], state: LinkState, inbox: Any, arrived: Any, moment: Moment
 ) -> tuple[LinkState, Array]:
     solver = solver.at(moment.time)
     state = _hear(solver, state, inbox, arrived)
@@ -140,25 +116,19 @@ def _hear(solver: OwnSolver, state: LinkState, inbox: Array, arrived: Array) -> 
     """Store the received messages. An agent without a valid λ adopts −λ̂ of the neighbour, and the neighbour's estimates of other positions.
     If neither has a valid λ, it stays 0."""
     d = state.x.shape[1]
-    there, theirs, told = inbox[:, :d], inbox[:, d : 2 * d], inbox[:, 2 * d] > 0
-    sure, mine = (arrived & told)[:, None], state.adopted[:, None] > 0
+    there, theirs, valid = inbox[:, :d], inbox[:, d : 2 * d], inbox[:, 2 * d] > 0
+    sure, mine = (arrived & valid)[:, None], state.adopted[:, None] > 0
     force = jnp.where(sure & mine, state.force - AGREE * (state.force + theirs), state.force)
     force = jnp.where(sure & ~mine, -theirs, force)
-    fresh = (arrived & told & (state.adopted <= 0)).astype(inbox.dtype)
+    fresh = (sure & ~mine)[:, 0].astype(inbox.dtype)
     count = solver.links.sum(fresh)
     taken = solver.links.sum(fresh[:, None] * there) / jnp.maximum(count, 1.0)[:, None]
-    others = jnp.arange(len(state.x)) != solver.me
+    others = jnp.arange(len(state.x), dtype=solver.own.dtype) != solver.own[0]
     return state._replace(
         x=jnp.where(((count > 0) & others)[:, None], taken, state.x),
         force=force,
         there=jnp.where(arrived[:, None], there, state.there),
         theirs=jnp.where(sure, theirs, state.theirs),
-        valid=jnp.where(arrived, told.astype(inbox.dtype), state.valid),
+        valid=jnp.where(arrived, valid.astype(inbox.dtype), state.valid),
         adopted=jnp.where(arrived, 1.0, state.adopted),
     )
-
-
-@functools.cache
-def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    options = quick_compilation()
-    return jax.jit(_begin, compiler_options=options), jax.jit(_turn, compiler_options=options)

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from pathlib import Path
 from typing import Any, Final
 
 import jax
 import numpy as np
 
 from consat.errors import InvalidSettings
-from consat.network.node.core import Moment, Rows
-from consat.network.node.fixed_rate import FAREWELLS
+from consat.network.node.core import IndexMap, Moment, Rows
 from consat.network.node.persistence import Store
+from consat.network.node.runner import Runner
 from consat.network.node.station import SILENT, Station
 from consat.network.wire import SUPPORT, Kind
 from consat.runs.options import RATE as ROUNDS_A_SECOND
@@ -32,24 +31,13 @@ SELDOM: Final = 0.2
 """Largest time between repetitions, s: where rounds are slow because the machine is busy, more messages would make it slower."""
 
 
-class Lockstep:
-    """Runner of one agent in lockstep.
+class Lockstep(Runner):
+    """Runner of one agent in lockstep. After the last round it still repeats it for neighbours that lack it."""
 
-    Args:
-        station: the agent's station.
-        turns: number of rounds; None for no end. After the last round the agent still repeats it for neighbours that lack it.
-        rate: largest number of rounds per second, Hz; unlimited if None. Round r is at time r/rate for schedules, with a rate of
-            `consat.runs.options.RATE` if None.
-        memory: file in which the state is stored; None for none.
-    """
-
-    def __init__(self, station: Station, turns: int | None = None, rate: float | None = None, memory: Path | None = None) -> None:
-        self.station = station
-        self.done = False
-        self._turns, self._period = turns, 0.0 if rate is None else 1.0 / rate
-        self._tick = 1.0 / (rate or ROUNDS_A_SECOND)  # s per round for schedules, as in a single process
-        self._round = 0  # number of rounds computed and sent
-        self._regrouped = 0  # `_round` at the last change of membership, from which a protocol counts its rounds
+    def __init__(self, station: Station) -> None:
+        super().__init__(station)
+        self._turns, self._period = station.settings.turns, station.settings.period
+        self._tick = self._period or 1.0 / ROUNDS_A_SECOND  # s per round for schedules, as in a single process
         self._message: dict[str, list[np.ndarray]] = {}
         self._blocks: dict[str, dict[int, Sequence[np.ndarray]]] = {neighbour: {} for neighbour in station.peers.all}
         self._rumours: dict[str, tuple[int, int]] = {}
@@ -58,16 +46,11 @@ class Lockstep:
         self._sent_at = -np.inf
         self._patience = self._usual = RESEND
         self._began = -np.inf
-        self._farewells = 0
         self._outbox: tuple[Rows, Rows] | None = None
-        self._state: Any = None
+        memory = station.settings.memory
         self._store = None if memory is None else Store(memory, self._size())
-        self._recall()
-
-    def leave(self) -> None:
-        """Leave for good: announce it in `FAREWELLS` messages, then be done."""
-        self.station.membership.drop(self.station.part.me)
-        self._farewells = FAREWELLS
+        if self._store is not None and (record := self._store.load()) is not None:
+            self._recall(np.frombuffer(record))
 
     def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
         """Raises: InvalidSettings: always; constraints cannot be changed in lockstep."""
@@ -81,12 +64,10 @@ class Lockstep:
         if self._farewells:
             if now - self._sent_at >= RESEND:
                 self._sent_at = now
-                self._farewells -= 1
-                self.done = self._farewells == 0
-                station.send_hello()
+                self._say_farewell()
             return self._sent_at + RESEND
         if self._state is None and station.body.position() is not None:
-            self._state = station.core.begin(station.present_rows(station.first()))
+            self._state = station.core.begin(station.first())
         if self._state is not None:
             if station.changed:
                 self._regroup()
@@ -121,7 +102,7 @@ class Lockstep:
                 before = self._blocks[message.source].get(reached - 1)
                 if before is not None and reached <= self._round:  # else the neighbour will be asked for the whole message
                     self._reached[message.source] = reached
-                    self._take(message.source, reached, self.station.unchanged(before), before)
+                    self._take(message.source, reached, self.station.codec.unchanged(before), before)
 
     def _take(self, neighbour: str, reached: int, current: Sequence[np.ndarray], previous: Sequence[np.ndarray]) -> None:
         """Store a neighbour's messages of round `reached` and of the round before it."""
@@ -163,7 +144,7 @@ class Lockstep:
         inbox, arrived = station.core.empty()
         for neighbour in station.present if self._round else ():  # no messages before the first round
             if (block := self._blocks[neighbour].get(self._round - 1)) is not None:
-                station.deliver(neighbour, block, inbox, arrived)
+                station.codec.decode(neighbour, block, inbox, arrived)
         moment = self._moment(self._round - self._regrouped)
         self._state, outbox, view = station.turn(self._state, inbox, arrived, moment)
         outbox, receivers = station.filter(outbox)
@@ -185,23 +166,23 @@ class Lockstep:
         time = (self._round + 1.0) * self._tick
         return Moment(float(number), 0.0, np.zeros(count), np.ones(count, dtype=bool), self.station.place(), time=time)
 
-    def _send(self, now: float, among: AbstractSet[str] | None = None) -> None:
-        """Send the message of this round to the neighbours in `among` (None for all), and to the others that it brings no news."""
+    def _send(self, now: float, to: AbstractSet[str] | None = None) -> None:
+        """Send the message of this round to the neighbours `to` (None for all), and to the others that it brings no news."""
         station = self.station
         assert self._outbox is not None
-        current, previous = (station.blocks(outbox) for outbox in self._outbox)
+        current, previous = map(station.codec.encode, self._outbox)
         number = np.array([self._round - 1.0])
         self._message = {neighbour: [*arrays, *previous[neighbour], number] for neighbour, arrays in current.items()}
         self._lacking.clear()
         self._sent_at = now
-        station.send(self._message, among=among)
-        if among is not None:
-            station.send_same(number, station.silent(among))
+        station.send(self._message, to)
+        if to is not None:
+            station.send_same(number, to)
 
     def _repeat(self, now: float) -> None:
         """Repeat the last message: to all neighbours while waiting, and after the last round to those that lack it."""
         station = self.station
-        to = [neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking]
+        to = {neighbour for neighbour in station.present if not self._over() or neighbour in self._lacking}
         self._sent_at = now
         self._patience = min(2.0 * self._patience, SELDOM)
         self._lacking.clear()
@@ -213,70 +194,54 @@ class Lockstep:
     def _regroup(self) -> None:
         station = self.station
         before = station.core
-        self._state = station.regroup(self._state, station.first())
+        self._state = station.regroup(self._state)
         self._regrouped = self._round
         if self._outbox is None:
             return
-        place = {end: k for k, end in enumerate(before.ends)}
-        rows = [place.get(end, -1) for end in station.core.ends]
-        if min(rows, default=0) >= 0 and not self._outbox[0].pair.size:
-            self._outbox = self._among(rows, self._outbox[0]), self._among(rows, self._outbox[1])
+        ends = IndexMap.of(station.core.core, before.core).link
+        if min(ends, default=0) >= 0 and not self._outbox[0].pair.size:
+            nothing = np.zeros((len(station.present), 0))
+            current, previous = (Rows(outbox.link[ends], nothing) for outbox in self._outbox)
+            self._outbox = current, previous
         else:  # an agent has joined, or messages per neighbour refer to the old membership: compute new messages
-            inbox, nothing = station.core.empty()
-            self._state, outbox, _ = station.turn(self._state, inbox, nothing, self._moment(0))
+            self._state, outbox, _ = station.turn(self._state, *station.core.empty(), self._moment(0))
             outbox, _ = station.filter(outbox)
             self._outbox = outbox, outbox
         self._save()
         self._send(station.clock())
-
-    def _among(self, rows: list[int], said: Rows) -> Rows:
-        """The rows of messages to neighbours that remain, for protocols without messages per neighbour."""
-        return Rows(said.link[rows], np.zeros((len(self.station.present), 0)))
 
     # -- stored state ------------------------------------------------------------------------------------------------------------------
 
     def _size(self) -> int:
         """Largest size of the stored record, in bytes: that with all agents present."""
         everyone = self.station.core.without(frozenset())
-        state = everyone.begin(self.station.part.first)
-        longest = max((numbers.shape[0] for numbers in everyone.pair_numbers.values()), default=0)
-        said = len(everyone.ends) * everyone.width + len(everyone.part.neighbours) * longest
-        numbers = sum(np.size(leaf) for leaf in jax.tree.leaves(state)) + 2 * said
-        return 8 * (numbers + self.station.part.team.count + 1)
+        outbox, _ = everyone.empty()
+        return self._record(0, (outbox, outbox), everyone.begin(self.station.part.first)).nbytes
+
+    def _record(self, round_: int, outbox: tuple[Rows, Rows], state: Any) -> np.ndarray:
+        """The numbers of a record."""
+        epochs = self.station.membership.of(self.station.part.team.ids)
+        leaves = jax.tree.leaves((round_, epochs, outbox, state))
+        return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in leaves])
 
     def _save(self) -> None:
-        if self._store is None or self._outbox is None:
-            return
-        leaves = [np.asarray(leaf, dtype=float).ravel() for leaf in jax.tree.leaves(self._state)]
-        epochs = self.station.membership.of(self.station.part.team.ids)
-        said = [box.ravel() for rows in self._outbox for box in rows]
-        self._store.save(np.concatenate([[float(self._round)], epochs, *said, *leaves]).tobytes())
+        if self._store is not None and self._outbox is not None:
+            self._store.save(self._record(self._round, self._outbox, self._state).tobytes())
 
-    def _recall(self) -> None:
-        record = None if self._store is None else self._store.load()
-        if record is None:
-            return
+    def _recall(self, record: np.ndarray) -> None:
+        """Continue from a stored record."""
         station = self.station
-        numbers = np.frombuffer(record)
         ids = station.part.team.ids
-        self._round = int(numbers[0])
-        station.membership.restore(ids, numbers[1 : 1 + len(ids)])
-        station.regroup(None, station.part.first)
-        at = 1 + len(ids)
-
-        def read(like: Any) -> Any:
-            """Read the next numbers of the record in the shapes of `like`."""
-            nonlocal at
-            leaves, structure = jax.tree.flatten(like)
-            restored = []
-            for leaf in leaves:
-                restored.append(numbers[at : at + np.size(leaf)].reshape(np.shape(leaf)))
-                at += np.size(leaf)
-            return jax.tree.unflatten(structure, restored)
-
+        (number,), epochs, numbers = np.split(record, [1, 1 + len(ids)])
+        self._round = int(number)
+        station.membership.restore(ids, epochs)
+        station.regroup(None)
         nothing, _ = station.core.empty()
-        self._outbox = read(nothing), read(nothing)
-        self._state = read(station.core.begin(station.present_rows(station.part.first)))
+        like = (nothing, nothing), station.core.begin(station.first())
+        leaves, structure = jax.tree.flatten(like)
+        parts = np.split(numbers, np.cumsum([np.size(leaf) for leaf in leaves])[:-1])
+        restored = [part.reshape(np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=True)]
+        self._outbox, self._state = jax.tree.unflatten(structure, restored)
         station.resume(self._outbox[0], self._state)
         station.log("resumed", round=self._round)
         self._send(station.clock())

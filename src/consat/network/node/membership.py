@@ -26,9 +26,9 @@ class Membership:
 
     def __init__(self, part: Part) -> None:
         self._me = part.me
-        self._epoch = {agent: 1 if agent in part.absent else 0 for agent in part.team.ids}
-        if self._epoch[part.me] % 2:
-            self._epoch[part.me] += 1
+        self._epoch = {agent: int(agent in part.absent) for agent in part.team.ids}
+        if part.me in part.absent:
+            self._epoch[part.me] = 2
 
     @property
     def gone(self) -> frozenset[str]:
@@ -39,8 +39,8 @@ class Membership:
         """The membership numbers of some agents."""
         return np.array([self._epoch[agent] for agent in agents], dtype=float)
 
-    def update(self, agents: Iterable[str], epochs: np.ndarray) -> bool:
-        """Update the numbers with those of a neighbour. Returns whether the number of another agent has changed.
+    def update(self, agents: Iterable[str], epochs: np.ndarray) -> None:
+        """Update the numbers with those of a neighbour. Absurd ones are ignored.
 
         If the neighbour reports this agent as absent, it raises its own number, which contradicts the report.
 
@@ -48,16 +48,13 @@ class Membership:
             agents: ids.
             epochs: their numbers, as received.
         """
-        news = False
-        for agent, told in zip(agents, epochs, strict=True):
-            if not (0 <= told <= MOST and told == int(told)) or told <= self._epoch[agent]:
+        for agent, epoch in zip(agents, epochs, strict=True):
+            if not (0 <= epoch <= MOST and epoch == int(epoch)) or epoch <= self._epoch[agent]:
                 continue
             if agent != self._me:
-                self._epoch[agent] = int(told)
-                news = True
+                self._epoch[agent] = int(epoch)
             elif not self._epoch[agent] % 2:
-                self._epoch[agent] = int(told) + int(told) % 2
-        return news
+                self._epoch[agent] = int(epoch) + int(epoch) % 2
 
     def drop(self, agent: str) -> None:
         """Mark an agent as absent for good: it is this agent that leaves, or a neighbour that was silent for too long."""

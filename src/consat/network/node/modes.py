@@ -1,26 +1,16 @@
-"""Build the runner of a node from its part and its mode, such as ``admm``: the core, the timing, and the transport's requirements."""
+"""The modes of communication, such as ``admm``: which protocols run in them, and the settings of an agent."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from consat.errors import InvalidSettings
-from consat.network.node.body import Body
-from consat.network.node.core import Embodied, RoundCore
-from consat.network.node.fixed_rate import FixedRate
-from consat.network.node.link_core import LinkCore
-from consat.network.node.lockstep import Lockstep
-from consat.network.node.pair_core import PairCore
-from consat.network.node.part import RUNS, Part
-from consat.network.node.station import REPORT, Log, Station
-from consat.network.transports import Transport
-from consat.protocols import PAIRED, ROUNDS, with_gains
+from consat.network.node.part import RUNS
+from consat.protocols import PAIRED, ROUNDS
 from consat.protocols.sending import BEAT
 from consat.settings import Sends
 
@@ -28,13 +18,15 @@ Mode = Literal["interior-point", "admm", "link", "lockstep"]
 DEFAULT_MODE: Final = "interior-point"
 RATE: Final = {"interior-point": 100.0, "admm": 100.0, "link": 50.0}
 """Default rate of steps, Hz, for each mode."""
+REPORT: Final = 0.1
+"""Default time between two reports, s."""
 HEARTBEAT: Final = 0.08
 """Longest silence of an agent, s: a neighbour takes it to be down only if six messages in succession are lost."""
 
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """Settings of a runner.
+    """Settings of an agent.
 
     Attributes:
         mode: mode of communication.
@@ -43,7 +35,7 @@ class NodeSettings:
         turns: number of steps after which the agent is done; None for no end.
         memory: in mode lockstep, a file for the state, from which a restarted agent continues; None for none.
         give_up: silence of a neighbour, s, after which it counts as having left for good.
-        report: time between two reports, s.
+        report: time between two reports, s; 0 reports after each step.
         sends: ``all``, or only what is news: ``events``; see `consat.protocols.sending`.
 
     Raises:
@@ -72,6 +64,12 @@ class NodeSettings:
             raise InvalidSettings(f"mode {self.mode} has no time of its own; only link takes a pace")
 
     @property
+    def period(self) -> float:
+        """Shortest time between two steps, s; 0 without limit, in lockstep."""
+        rate = self.rate or RATE.get(self.mode)
+        return 0.0 if rate is None else 1.0 / rate
+
+    @property
     def beat(self) -> float | None:
         """Turns of silence after which an agent repeats itself, ∞ in lockstep; None where it sends all."""
         if self.sends == "all":
@@ -82,41 +80,6 @@ class NodeSettings:
     def reliable(self) -> bool:
         """Whether the transport should block instead of dropping messages."""
         return self.mode == "lockstep"
-
-
-class Runner(Protocol):
-    """An agent that runs step by step."""
-
-    @property
-    def station(self) -> Station:
-        """The agent's station: neighbours, body and log."""
-        ...
-
-    @property
-    def done(self) -> bool:
-        """Whether the agent has finished."""
-        ...
-
-    def step(self) -> float:
-        """Do what is due. Returns the latest time of the next call, by the station's clock, s. Call it also when a message arrives."""
-        ...
-
-    def change(self, constraint: str, parameters: Mapping[str, Any]) -> None:
-        """Change parameters of one of the agent's own constraints.
-
-        Args:
-            constraint: name of the constraint.
-            parameters: new values of its parameters.
-
-        Raises:
-            InvalidTeam: the values are invalid; nothing has changed.
-            InvalidSettings: the mode does not allow changes.
-        """
-        ...
-
-    def leave(self) -> None:
-        """Leave the team for good: the others continue without this agent's constraints."""
-        ...
 
 
 def protocol_of(mode: Mode, asked: str | None) -> str:
@@ -145,49 +108,3 @@ def protocol_of(mode: Mode, asked: str | None) -> str:
 def mode_for(kind: str | None) -> Mode:
     """Default mode for a protocol."""
     return "admm" if kind == "admm" else DEFAULT_MODE
-
-
-def core_of(part: Part, settings: NodeSettings) -> Embodied:
-    """Build the core of the agent: the protocol compiled for it."""
-    asked = part.settings.protocol
-    kind = protocol_of(settings.mode, asked.kind)
-    if settings.mode == "link":
-        gains = {"k1": 1.0, "k2": 1.0} | {key: value for key in ("k1", "k2") if (value := getattr(asked, key)) is not None}
-        return Embodied(LinkCore(part, gains["k1"] * settings.pace, gains["k2"] * settings.pace))
-    protocol = with_gains(ROUNDS[kind](), asked)
-    return Embodied(PairCore(protocol, part) if kind in PAIRED else RoundCore(protocol, part))
-
-
-def runner_of(
-    part: Part,
-    settings: NodeSettings,
-    transport: Transport,
-    *,
-    clock: Callable[[], float],
-    incarnation: int,
-    body: Body,
-    log: Log,
-    core: Embodied | None = None,
-    wall: Callable[[], float] = time.time,
-) -> Runner:
-    """Build the runner of an agent, which starts with its first step.
-
-    Args:
-        part: the agent's part.
-        settings: settings of the runner.
-        transport: transport of the messages.
-        clock: the agent's clock, s.
-        incarnation: a number that is larger after each restart of the agent.
-        body: sensor and actuator.
-        log: function that takes events.
-        core: result of `core_of`, if it was computed before.
-        wall: Unix time, s.
-    """
-    lockstep = settings.mode == "lockstep"
-    station = Station(
-        part, core or core_of(part, settings), settings.mode, transport, clock=clock, incarnation=incarnation, body=body, log=log,
-        lockstep=lockstep, beat=settings.beat, give_up=settings.give_up, report=settings.report, wall=wall,
-    )  # fmt: skip
-    if lockstep:
-        return Lockstep(station, turns=settings.turns, rate=settings.rate, memory=settings.memory)
-    return FixedRate(station, settings.rate or RATE[settings.mode], settings.turns)

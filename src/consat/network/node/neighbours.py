@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,32 +95,17 @@ class Peers:
                 accepted.append(message)
         return accepted
 
-    def send(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: tuple[int, ...] = ()) -> None:
+    def send(self, neighbour: str, kind: Kind, arrays: Sequence[np.ndarray], single: Container[int] = ()) -> None:
         """Send a message to a neighbour. `single`: indices of the arrays that are written in 32 bits."""
         peer, now = self.all[neighbour], self._clock()
         peer.sequence += 1
         echo, ack = (np.nan, 0) if peer.last is None else (peer.last.sent + (now - peer.heard), peer.last.sequence)
-        payload = encode(
-            Message(
-                kind,
-                self._problem,
-                self._part.me,
-                neighbour,
-                self._incarnation,
-                peer.sequence,
-                now,
-                echo,
-                ack,
-                float(self._part.nu.beta),
-                tuple(arrays),
-            ),
-            single,
-        )
+        message = Message(
+            kind, self._problem, self._part.me, neighbour, self._incarnation, peer.sequence, now, echo, ack, float(self._part.nu.beta),
+            tuple(arrays),
+        )  # fmt: skip
+        payload = encode(message, single)
         self._transport.send(neighbour, payload)
         self.sent["messages"] += 1
         self.sent["floats"] += sum(array.size for array in arrays)
         self.sent["bytes"] += len(payload)
-
-    def alive(self) -> frozenset[str]:
-        """Agents that the transport reports as alive."""
-        return self._transport.alive()

@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from consat.network.node.core import Embodied, RoundCore, Rows
+from consat.network.node.core import Rows
+from consat.network.node.embodied import Embodied, columns_of, word_of
 from consat.network.node.pair_core import PairCore
-from consat.numerics import quick_compilation
+from consat.network.node.round_core import RoundCore
+from consat.numerics import quickly_compiled
 from consat.protocols import Rounds, sending
-from consat.protocols.agreement import NEVER, Word
+from consat.protocols.agreement import NEVER
 from consat.protocols.sending import Crossing, Held
-
-
-class Sent(NamedTuple):
-    """What an agent remembers of what it sent.
-
-    Attributes:
-        rows: the rows that the neighbours hold.
-        since: see `consat.protocols.sending.Held`.
-        place: see `consat.protocols.sending.Held`.
-    """
-
-    rows: Rows
-    since: np.ndarray
-    place: np.ndarray
 
 
 class NewsFilter:
@@ -44,14 +29,12 @@ class NewsFilter:
     def __init__(self, core: Embodied, beat: float) -> None:
         inner = core.core
         assert isinstance(inner, RoundCore | PairCore), "mode link sends everything"
-        self._core, self._inner, self._beat = core, inner, beat
+        self._core, self._beat = inner, beat
         order = [neighbour.id for neighbour in core.part.neighbours]
         self._pair = jnp.asarray(np.array([order.index(neighbour) for neighbour, _ in core.ends], dtype=np.int32))
-        shape = core.part.team.dimension, inner.width, len(order)
-        self._how = _How(inner.protocol, inner.layout if isinstance(inner, RoundCore) else None, shape, not np.isfinite(beat))
-        self._packing = inner.packing if isinstance(inner, PairCore) else None
-        empty, _ = core.empty()
-        self._sent = Sent(empty, np.full(len(order), NEVER), np.zeros((len(core.ends), shape[0])))
+        self._held, _ = core.empty()
+        self._since: Any = np.full(len(order), NEVER)
+        self._place: Any = np.zeros((len(core.ends), core.part.team.dimension))
 
     def resume(self, rows: Rows, bodies: np.ndarray) -> None:
         """Continue after a restart.
@@ -60,64 +43,40 @@ class NewsFilter:
             rows: the rows that were sent last.
             bodies: (rows, d) positions of the bodies at that time.
         """
-        place = np.asarray(self._core.core.solver.links.at(jnp.asarray(bodies)))
-        self._sent = Sent(rows, np.ones(len(self._sent.since)), place)
+        self._held, self._since = rows, np.ones(len(self._since))
+        self._place = np.asarray(self._core.solver.links.at(jnp.asarray(bodies)))
 
     def filter(self, rows: Rows) -> tuple[Rows, np.ndarray]:
         """The rows that the neighbours hold after this step, and (G,) to which of them a message must be sent."""
-        found = _compiled()(self._how, self._inner.solver, self._packing, rows, self._sent, (self._pair, self._beat))
-        link, pair, since, place, goes = map(np.asarray, found)
-        self._sent = Sent(Rows(link, pair), since, place)
-        return self._sent.rows, goes
+        core, before = self._core, (self._held, self._since, self._place)
+        lasting = bool(np.isinf(self._beat))
+        held, self._since, self._place, goes = _filtered(
+            core.protocol, core.packing, core.solver, rows, before, self._pair, beat=self._beat, lasting=lasting
+        )
+        self._held = Rows(*map(np.asarray, held))
+        return self._held, np.asarray(goes)
 
 
-class _How(NamedTuple):
-    """Static arguments of the compiled function.
-
-    Attributes:
-        protocol: the protocol.
-        layout: layout of its messages; None for messages per neighbour.
-        shape: dimension, width of the rows, and number of neighbours.
-        lasting: whether silence means "as before".
-    """
-
-    protocol: Rounds
-    layout: Any
-    shape: tuple[int, int, int]
-    lasting: bool
-
-
-def _crossing(how: _How, solver: Any, packing: Any, rows: Rows) -> Crossing:
-    d, width, _ = how.shape
-    link = jnp.asarray(rows.link)
-    word = Word(link[:, width : width + d], link[:, width + d], link[:, width + d + 1])
-    if packing is not None:
-        return Crossing(packing.unpack(jnp.asarray(rows.pair), solver.interior.plan.width), jnp.zeros(len(link)), word)
-    return Crossing(how.layout.unpack(link), link[:, width - 1], word)
-
-
-def _rows(how: _How, packing: Any, crossing: Crossing, pair: Array) -> tuple[Array, Array]:
-    word, count = crossing.word, len(crossing.told)
-    assert word is not None
-    bodies = [word.position, word.stale[:, None], word.age[:, None]]
-    if packing is not None:
-        return jnp.concatenate(bodies, axis=1), packing.pack(crossing.message)
-    leaves = [leaf.reshape(count, size) for leaf, size in zip(jax.tree.leaves(crossing.message), how.layout.sizes, strict=True)]
-    return jnp.concatenate([*leaves, crossing.told[:, None], *bodies], axis=1), pair
-
-
+@quickly_compiled("protocol", "lasting")
 def _filtered(
-    how: _How, solver: Any, packing: Any, rows: Rows, sent: Sent, to: tuple[Array, Array]
-) -> tuple[Array, ...]:  # fmt: skip
-    pair, beat = to
-    new, old = (_crossing(how, solver, packing, each) for each in (rows, sent.rows))
-    held = Held(old, jnp.asarray(sent.since), jnp.asarray(sent.place))
-    crossing, held, goes = sending.sifted(how.protocol, solver, new, held, pair, beat=beat, lasting=how.lasting)
-    link, mail = _rows(how, packing, crossing, jnp.asarray(rows.pair))
-    assert held.place is not None
-    return link, mail, held.since, held.place, goes
+    protocol: Rounds, packing: Any, solver: Any, rows: Rows, before: tuple[Rows, Any, Any], pair: Array, *, beat: float, lasting: bool
+) -> tuple[Rows, Any, Any, Array]:  # fmt: skip
+    held, since, place = before
+    new, old = (_crossing(protocol, packing, each) for each in (rows, held))
+    crossing, after, goes = sending.sifted(protocol, solver, new, Held(old, since, place), pair, beat=beat, lasting=lasting)
+    assert crossing.word is not None
+    words = columns_of(crossing.word)
+    if protocol.speaks == "pair":
+        held = Rows(words, packing.pack(crossing.message))
+    else:
+        held = rows._replace(link=jnp.concatenate([packing.pack(crossing.message), crossing.told[:, None], words], axis=1))
+    return held, after.since, after.place, goes
 
 
-@functools.cache
-def _compiled() -> Callable[..., Any]:
-    return jax.jit(_filtered, static_argnames=("how",), compiler_options=quick_compilation())
+def _crossing(protocol: Rounds, packing: Any, rows: Rows) -> Crossing:
+    """The messages from their rows; see `RoundCore` and `Embodied` for the columns."""
+    link = jnp.asarray(rows.link)
+    if protocol.speaks == "pair":
+        return Crossing(packing.unpack(rows.pair), jnp.zeros(len(link)), word_of(link))
+    width = sum(packing.sizes)
+    return Crossing(packing.unpack(link[:, :width]), link[:, width], word_of(link[:, width + 1 :]))

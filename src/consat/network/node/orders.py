@@ -125,7 +125,7 @@ class Orders:
         except (ValueError, RecursionError):
             return "it is no JSON"
         if isinstance(value, dict) and "position" in value and "command" not in value:
-            return self._measure(line, value["position"], value.get("stamp"), value)
+            return self._measure(line, value)
         order = order_of(value, line[:SHOWN])
         if isinstance(order, str):
             return order
@@ -139,14 +139,14 @@ class Orders:
             return f"{HELD} orders wait already; tell it again later"
         return None
 
-    def _measure(self, line: str, position: Any, stamp: Any, order: dict[str, Any]) -> str | None:
+    def _measure(self, line: str, given: dict[str, Any]) -> str | None:
+        position, stamp, heading, others = map(given.get, ("position", "stamp", "heading", "neighbours"))
         if self._dimension is None:
             return "the position of this agent is simulated; start it with --sensor stdin to measure it"
         if not _is_place(position, self._dimension):
             return f"position must be a list of {self._dimension} finite numbers"
         if not (stamp is None or _is_coordinate(stamp)):
             return "stamp must be a finite number"
-        heading, others = order.get("heading"), order.get("neighbours")
         if not (heading is None or _is_coordinate(heading)):
             return "heading must be a finite number, rad"
         if not (others is None or (isinstance(others, list) and all(_is_place(each, self._dimension) for each in others))):

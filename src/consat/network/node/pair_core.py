@@ -14,7 +14,7 @@ Knowledge about the team beyond the neighbours must become invalid after false m
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -25,8 +25,8 @@ from jax import Array
 from consat.network.node.core import Core, IndexMap, Moment, Rows, StepResult
 from consat.network.node.pairs import MessageLayout, Packing
 from consat.network.node.part import Part
-from consat.network.node.problem import OwnSolver, ends
-from consat.numerics import quick_compilation
+from consat.network.node.problem import OwnSolver
+from consat.numerics import quickly_compiled
 from consat.problem.constraints.library import farthest
 from consat.protocols import InteriorPoint, Known
 from consat.protocols.interior_point import InteriorState
@@ -52,62 +52,43 @@ class PairState(NamedTuple):
     turns: Array
 
 
-class PairCore:
-    """`consat.network.node.core.Core` of the interior-point protocol; see the module.
-
-    Args:
-        protocol: the protocol.
-        whole: the agent's part, with all agents.
-        gone: agents that are absent.
-    """
+class PairCore(Core):
+    """See the module."""
 
     def __init__(self, protocol: InteriorPoint, whole: Part, gone: Collection[str] = ()) -> None:
-        self.protocol, self.whole = protocol, whole
-        self.part = whole.without(gone)
-        self.ends = ends(self.part)
-        self.solver = OwnSolver.of(self.part, protocol.speaks)
+        super().__init__(protocol, whole, gone)
         self.width, self.largest = 0, np.zeros(0)
-        self.pair_numbers = {neighbour.id: MessageLayout.of(neighbour, whole.team.dimension).numbers() for neighbour in whole.neighbours}
+        layouts = {neighbour.id: MessageLayout.of(neighbour, whole.team.dimension) for neighbour in whole.neighbours}
+        self.pair_numbers = {neighbour: layout.numbers() for neighbour, layout in layouts.items()}
+        self._weights = [layouts[neighbour.id].weight for neighbour in self.part.neighbours]
         assert self.solver.interior is not None
         self.packing = Packing.of(whole, self.part, self.solver.interior.plan.width)
-        self._weight = {neighbour.id: MessageLayout.of(neighbour, whole.team.dimension).weight for neighbour in whole.neighbours}
         order = [neighbour for neighbour, _ in self.ends]
         self._end = np.array([order.index(neighbour.id) for neighbour in self.part.neighbours], dtype=int)
-        self._begin, self._turn = _compiled()
 
     def begin(self, first: np.ndarray, time: float = 0.0) -> PairState:
-        return self._begin(self.protocol, self.solver, first, time)
+        return _begin(self.protocol, self.solver, first, time)
 
     def turn(self, state: PairState, inbox: Rows, arrived: Rows, moment: Moment) -> StepResult:
         heard = inbox.pair, arrived.pair, moment.fresh[self._end]
         when = moment.round, moment.margin, moment.time
-        state, said, bound, least = self._turn(self.protocol, self.solver, self.packing, state, heard, when)
-        said = np.asarray(said)
-        if asks_for(self.part) > FAR * self.part.reach:
-            said, bound = self._without_proof(said), np.inf
-        return StepResult(state, Rows(inbox.link, said), np.asarray(state.inner.x), float(bound), float(least))
-
-    def _without_proof(self, said: np.ndarray) -> np.ndarray:
-        said = said.copy()
-        for row, neighbour in zip(said, self.part.neighbours, strict=True):
-            at = self._weight[neighbour.id]
-            row[at:] = 0.0
-            row[at] = -1.0
-        return said
-
-    def without(self, gone: Collection[str], whole: Part | None = None) -> PairCore:
-        return PairCore(self.protocol, whole or self.whole, gone)
+        state, mail, bound, least = _turn(self.protocol, self.solver, self.packing, state, heard, when)
+        outbox = np.array(mail)
+        if proves_nothing := asks_for(self.part) > FAR * self.part.reach:
+            for row, weight in zip(outbox, self._weights, strict=True):
+                row[weight:] = 0.0
+                row[weight] = -1.0
+        return StepResult(
+            state, Rows(inbox.link, outbox), np.asarray(state.inner.x), np.inf if proves_nothing else float(bound), float(least)
+        )
 
     def without_proofs(self, state: PairState) -> PairState:
         """Copy of the state with the count of changes raised by one, and without bounds."""
-        memory: Any = state.inner.memory
-        more: Any = {"changes": np.asarray(memory.changes) + 1.0, "bound": np.full(np.shape(memory.bound), np.inf)}  # JAX would compile
-        forgotten: Any = np.full(2, np.inf)
-        return state._replace(inner=state.inner._replace(memory=memory._replace(**more)), bounds=forgotten)
+        return state._replace(inner=state.inner.changed([0]), bounds=np.full(2, np.inf))  # type: ignore[arg-type] # JAX would compile
 
     def carry(self, other: Core, state: PairState, first: np.ndarray, time: float = 0.0) -> PairState:
         """Initial state with the old estimates, and with the count of changes raised by one."""
-        fresh = self.begin(np.asarray(IndexMap.of(self, other).merge("row", state.inner.x, first)), time)
+        fresh = self.begin(np.asarray(IndexMap.of(self, other).rows(state.inner.x, first)), time)
         memory = fresh.inner.memory._replace(changes=state.inner.memory.changes + 1.0)
         return fresh._replace(inner=fresh.inner._replace(memory=memory))
 
@@ -118,7 +99,8 @@ def asks_for(part: Part) -> float:
     return max((farthest(family.psi, family.parameters, part.center) for family in part.team.families), default=0.0)
 
 
-def _begin(protocol: InteriorPoint, solver: OwnSolver, first: Array, time: Array) -> PairState:
+@quickly_compiled("protocol")
+def _begin(protocol: InteriorPoint, solver: OwnSolver, first: Any, time: Any) -> PairState:
     return _strong(PairState(protocol.start(first, solver.at(time)), jnp.full(2, jnp.inf), jnp.zeros(())))
 
 
@@ -128,19 +110,18 @@ def _strong(state: PairState) -> PairState:
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), state)
 
 
+@quickly_compiled("protocol")
 def _turn(
     protocol: InteriorPoint,
     solver: OwnSolver,
     packing: Packing,
     state: PairState,
-    heard: tuple[Array, Array, Array],
-    moment: tuple[Array, Array, Array],
+    heard: tuple[Any, Any, Any],
+    moment: tuple[Any, Any, Any],
 ) -> tuple[PairState, Array, Array, Array]:
     (inbox, arrived, fresh), (round_, margin, time) = heard, moment
     solver = solver.at(time)
-    interior = solver.interior
-    assert interior is not None
-    inner = protocol.hear(state.inner, packing.unpack(inbox, interior.plan.width), arrived, solver)
+    inner = protocol.hear(state.inner, packing.unpack(inbox), arrived, solver)
     inner = inner._replace(
         memory=inner.memory._replace(bound=jnp.full(1, jnp.inf)),
         inbox=inner.inbox._replace(margin=jnp.where(fresh, inner.inbox.margin, -jnp.inf)),
@@ -153,13 +134,3 @@ def _turn(
     full = (state.turns + 1.0) % FORGET == 0
     bounds = jnp.where(full, jnp.stack([since, jnp.full_like(since, jnp.inf)]), jnp.stack([older, since]))
     return _strong(PairState(inner, bounds, state.turns + 1.0)), packing.pack(message), jnp.min(bounds), least
-
-
-@functools.cache
-def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The compiled functions, which all agents of the same shape share."""
-    options = quick_compilation()
-    return (
-        jax.jit(_begin, static_argnames=("protocol",), compiler_options=options),
-        jax.jit(_turn, static_argnames=("protocol",), compiler_options=options),
-    )

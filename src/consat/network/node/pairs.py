@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -145,13 +144,17 @@ def _semidefinite(numbers: np.ndarray, size: int) -> bool:
 class Packing:
     """Index tables between the mail to G neighbours, flattened to F numbers each, and their messages of up to W numbers.
 
+    Flat mail has first the scalars, then both quadratics.
+
     Attributes:
         out: (G, W) index in the flat mail of each entry of the message; padded with F.
         back: (G, F) index in the message of each entry of the flat mail; padded with W.
+        width: p of the mail.
     """
 
     out: Array
     back: Array
+    width: int = field(metadata={"static": True})
 
     @classmethod
     def of(cls, whole: Part, part: Part, width: int) -> Packing:
@@ -165,25 +168,20 @@ class Packing:
         dimension, known = whole.team.dimension, {neighbour.id: neighbour for neighbour in whole.neighbours}
         layouts = [MessageLayout.of(known[neighbour.id], dimension) for neighbour in part.neighbours]
         kept = [MessageLayout.of(neighbour, dimension) for neighbour in part.neighbours]
-        count = _Flat(width).total
-        longest = max((layout.length for layout in layouts), default=0)
-        out, back = np.full((len(layouts), longest), count), np.full((len(layouts), count), longest)
+        total, longest = HEAD + TAIL + 2 * (width**2 + width), max((layout.length for layout in layouts), default=0)
+        out, back = np.full((len(layouts), longest), total), np.full((len(layouts), total + 1), longest)
+        upper = np.triu_indices(width)
         for row, (layout, there) in enumerate(zip(layouts, kept, strict=True)):
-            for place, numbers in enumerate(_layout(layout, there, _Flat(width))):
-                if numbers:
-                    out[row, place] = numbers[0]
-                    back[row, numbers] = place
-        return cls(on_device(out.astype(np.int32)), on_device(back.astype(np.int32)))
-
-    @property
-    def longest(self) -> int:
-        """W, the length of the longest message."""
-        return self.out.shape[1]
+            entries = _entries(layout, there, np.arange(total), width)
+            out[row, : len(entries)] = entries
+            back[row, entries] = np.arange(len(entries))
+            for matrix, _ in _quadratics(np.arange(total), width):
+                back[row, matrix.T[upper]] = back[row, matrix[upper]]
+        return cls(on_device(out.astype(np.int32)), on_device(back[:, :total].astype(np.int32)), width)
 
     def pack(self, mail: Mail) -> Array:
         """(G, W) the messages for a mail."""
-        count = len(self.out)
-        proof = mail.proof
+        count, proof = len(self.out), mail.proof
         leaves = (
             mail.changes, mail.barrier, mail.level, mail.margin, proof.weight, proof.constant, proof.error,
             mail.matrix, mail.vector, proof.matrix, proof.vector,
@@ -192,57 +190,40 @@ class Packing:
         flat = jnp.concatenate([*rows, jnp.zeros((count, 1))], axis=1)
         return jnp.take_along_axis(flat, self.out, axis=1)
 
-    def unpack(self, packed: Array, width: int) -> Mail:
-        """The mail of messages, (G, W). `width`: p of the mail."""
-        count = len(self.back)
-        flat = jnp.take_along_axis(jnp.concatenate([packed, jnp.zeros((count, 1))], axis=1), self.back, axis=1)
-        cut = _Flat(width)
-        numbers = [flat[:, k] for k in range(HEAD + TAIL)]
-        changes, barrier, level, margin, weight, constant, error = numbers
-        matrix, vector, slope, force = (flat[:, begin:end].reshape(count, *shape) for begin, end, shape in cut.arrays)
+    def unpack(self, packed: Array) -> Mail:
+        """The mail of messages, (G, W)."""
+        flat = jnp.take_along_axis(jnp.concatenate([packed, jnp.zeros((len(self.back), 1))], axis=1), self.back, axis=1)
+        changes, barrier, level, margin, weight, constant, error = flat[:, : HEAD + TAIL].T
+        (matrix, vector), (slope, force) = _quadratics(flat, self.width)
         return Mail(matrix, vector, barrier, level, margin, changes, Proof(slope, force, constant, weight, error))
 
 
-class _Flat(NamedTuple):
-    """Layout of the flat mail to one neighbour: first the scalars, then both quadratics. `width`: p of the mail."""
-
-    width: int
-
-    @property
-    def arrays(self) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-        """Begin, end and shape of each array in the flat mail."""
-        at, p = HEAD + TAIL, self.width
-        for shape in ((p, p), (p,), (p, p), (p,)):
-            size = int(np.prod(shape))
-            yield at, at + size, shape
-            at += size
-
-    @property
-    def total(self) -> int:
-        """F, the number of entries."""
-        return HEAD + TAIL + 2 * (self.width**2 + self.width)
+def _quadratics(flat: Any, p: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Matrix, (…, p, p), and vector, (…, p), of the quadratic and of that of the proof in flat mail, (…, F)."""
+    begin, size = HEAD + TAIL, p**2 + p
+    one, other = (
+        (part[..., : p**2].reshape(*part.shape[:-1], p, p), part[..., p**2 :])
+        for part in (flat[..., begin : begin + size], flat[..., begin + size :])
+    )
+    return one, other
 
 
-def _layout(layout: MessageLayout, there: MessageLayout, flat: _Flat) -> Iterator[list[int]]:
-    """For each entry of a message the indices of the equal entries of the flat mail; none for absent agents.
+def _entries(layout: MessageLayout, there: MessageLayout, flat: np.ndarray, p: int) -> np.ndarray:
+    """Index in the flat mail of each entry of a message; F for absent agents.
 
     Args:
         layout: layout of the message, with all agents.
         there: layout of the mail, without absent agents.
-        flat: layout of the flat mail.
+        flat: (F,) the indices of flat mail.
+        p: width of the mail.
     """
-    place = {name: k for k, name in enumerate(there.names)}
-    matrix, vector, slope, force = (begin for begin, *_ in flat.arrays)
-    yield from ([k] for k in range(3))
-    yield [3] if layout.level else []
-    for names, square, line, head in (
-        (layout.names, matrix, vector, range(0)),
-        (layout.names[: layout.size - layout.level], slope, force, range(HEAD, HEAD + TAIL)),
-    ):
-        yield from ([k] for k in head)
-        at = [place.get(name) for name in names]
-        for a, left in enumerate(at):
-            for right in at[a:]:
-                both = left is not None and right is not None
-                yield [square + left * flat.width + right, square + right * flat.width + left] if both else []  # type: ignore[operator]
-        yield from ([] if k is None else [line + k] for k in at)
+    absent, place = len(flat), {name: k for k, name in enumerate(there.names)}
+    heads = [0, 1, 2, 3 if layout.level else absent], range(HEAD, HEAD + TAIL)
+    names = layout.names, layout.names[: layout.size - layout.level]
+    entries: list[Any] = []
+    for head, shared, quadratic in zip(heads, names, _quadratics(flat, p), strict=True):
+        matrix, vector = (np.pad(indices, (0, 1), constant_values=absent) for indices in quadratic)
+        at = np.array([place.get(name, p) for name in shared], dtype=int)
+        rows, columns = np.triu_indices(len(at))
+        entries += [head, matrix[at[rows], at[columns]], vector[at]]
+    return np.concatenate(entries)

@@ -137,6 +137,11 @@ class Part:
     robots: Robots | None = None
 
     @property
+    def own(self) -> int:
+        """Row of the agent's own position."""
+        return self.team.ids.index(self.me)
+
+    @property
     def nu(self) -> Nu:
         """The smoothing, which is constant during a run, so that an agent that restarts has the same."""
         smoothing = self.settings.smoothing

@@ -60,7 +60,3 @@ class Store:
         start = self._half * (self._number % 2)
         self._map[start + _HEAD.size : start + _HEAD.size + len(record)] = record
         _HEAD.pack_into(self._map, start, _MAGIC, self._number, len(record), crc32(record, self._number))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._map.close()

@@ -66,15 +66,15 @@ class RobotBody(MeasuredBody):
         self._command(np.zeros(dimension), np.zeros(dimension), 0.0)  # compiles now
 
     def measure(self, new: Measurement) -> str | None:
-        turns = isinstance(self._drive.model, Unicycle)
-        if turns and new.heading is None:
+        model = self._drive.model
+        if isinstance(model, Unicycle) and new.heading is None:
             return "heading is missing: which way the robot looks, rad"
         others = new.neighbours
         if others is None:
             return "neighbours is missing: the positions of the robots near it, [] for nobody"
         heading, middle = new.heading or 0.0, new.position
-        if isinstance(self._drive.model, Unicycle):  # constraints apply to the steered point
-            ahead = float(np.max(self._drive.model.offset)) * np.array([np.cos(heading), np.sin(heading)])
+        if isinstance(model, Unicycle):  # constraints apply to the steered point
+            ahead = float(np.max(model.offset)) * np.array([np.cos(heading), np.sin(heading)])
             new = new._replace(position=new.position + ahead)
         if (why := super().measure(new)) is None:
             self._heading, self._near, self._middle = heading, others, middle

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import jax
@@ -72,12 +72,10 @@ class OwnSolver(LocalSolver):
     Attributes:
         links: the ends of links at the agent.
         live: changeable parameters of its constraints.
-        me: row of its own position.
     """
 
     links: OwnLinks
     live: Live
-    me: int = field(metadata={"static": True})
 
     @classmethod
     def of(cls, part: Part, speaks: str = "link") -> OwnSolver:
@@ -88,23 +86,21 @@ class OwnSolver(LocalSolver):
             speaks: see `consat.protocols.Rounds.speaks`.
         """
         team = part.team
-        me = team.ids.index(part.me)
         return cls(
             links=OwnLinks.of(part),
             length=on_device(part.length),
             region=Region(on_device(part.center), on_device(part.reach)),
             interior=_interior(part) if speaks == "pair" else None,
-            plan=_plan(part, me) if speaks == "link" else None,
+            plan=_plan(part) if speaks == "link" else None,
             nu=Nu(on_device(part.nu.alpha), on_device(part.nu.beta)),
             local=replace(Objective.at_positions(team), owners=Groups.of(np.zeros_like(team.owner), 1)),
             holder=jnp.zeros(team.count, dtype=np.int32),
-            own=jnp.array([me], dtype=np.int32),
+            own=jnp.array([part.own], dtype=np.int32),
             talkers=Groups.of(np.zeros(len(ends(part)), dtype=np.int32), 1),
             hops=part.hops,
             convex=part.convex,
             precision=EXACT,
             live=live_of(part),
-            me=me,
         )
 
     def at(self, time: Array | float) -> Self:
@@ -119,10 +115,10 @@ def live_of(part: Part) -> Live:
     return live
 
 
-def _plan(part: Part, me: int) -> prox.Plan:
+def _plan(part: Part) -> prox.Plan:
     plan = prox.buckets(part.team, lambda _, position: position, part.team.count, part.convex, live=True)
     batches = tuple(replace(batch, agents=jnp.zeros_like(batch.agents)) for batch in plan.batches)
-    return prox.Plan(batches, plan.row, plan.agent[me : me + 1], 1)
+    return prox.Plan(batches, plan.row, plan.agent[part.own : part.own + 1], 1)
 
 
 def _interior(part: Part) -> Interior:
@@ -132,7 +128,7 @@ def _interior(part: Part) -> Interior:
     rows = [[*map(team.ids.index, neighbour.travels), *[-1] * neighbour.level] for neighbour in part.neighbours]
     pair = np.repeat(np.arange(len(rows)), [len(shares) for shares in rows])
     talks = np.stack([np.zeros(len(rows), dtype=np.int32), np.arange(len(rows), dtype=np.int32)], axis=1)
-    me = np.array([team.ids.index(part.me)], dtype=np.int32)
+    me = np.array([part.own], dtype=np.int32)
     families = [replace(family, owner=np.zeros_like(family.owner)) for family in team.families]
     one = team.with_constraints(families, np.zeros_like(team.owner), team.names)
     one.ids = (part.me,)

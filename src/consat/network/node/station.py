@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from typing import Any, Final, Literal
@@ -13,23 +13,22 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam
 from consat.network.node import guard
 from consat.network.node.body import Body
-from consat.network.node.core import LARGEST, AgentView, Embodied, Moment, Rows
+from consat.network.node.codec import Codec
+from consat.network.node.core import Moment, Rows
+from consat.network.node.embodied import AgentView, Embodied
 from consat.network.node.membership import Membership
+from consat.network.node.modes import NodeSettings
 from consat.network.node.neighbours import Peers
 from consat.network.node.news import NewsFilter
-from consat.network.node.pair_core import PairCore
-from consat.network.node.pairs import MessageLayout, halves, whole
-from consat.network.node.part import Neighbour, Part
+from consat.network.node.part import Part
 from consat.network.transports import Transport
-from consat.network.wire import VERSION, Expected, Kind, Message, Numbers, Reason
+from consat.network.wire import VERSION, Kind, Message, Reason
 from consat.numerics import float64, number
 from consat.problem.changes import adjusted, changed, changes_of, is_adjustment
 from consat.problem.schedule import Schedule
 
 SILENT: Final = 0.5
 """Time without a message, s, after which a neighbour counts as down."""
-REPORT: Final = 0.1
-"""Time between two reports, s."""
 
 Knowledge = Literal["satisfied", "infeasible"] | None
 """What an agent knows about the whole team: all are satisfied; proven infeasible; or neither (None)."""
@@ -42,16 +41,12 @@ class Station:
     Args:
         part: the agent's part.
         core: the protocol compiled for the agent.
-        mode: name of the mode; messages of other modes are refused.
+        settings: settings of the agent; messages of agents with another mode are refused.
         transport: transport of the messages.
         clock: the agent's clock, s.
         incarnation: a number that is larger after each restart of the agent.
         body: sensor and actuator.
         log: function that takes events (JSON-serialisable data).
-        lockstep: whether a message contains two rounds, and the number of the newer one.
-        beat: number of silent steps after which an agent that sends only news repeats itself; None if it sends everything.
-        give_up: silence of a neighbour, s, after which it counts as having left for good.
-        report: time between two reports, s; 0 reports after each step.
         wall: Unix time, s, which the agents of a team share.
     """
 
@@ -59,39 +54,28 @@ class Station:
         self,
         part: Part,
         core: Embodied,
-        mode: str,
+        settings: NodeSettings,
         transport: Transport,
         *,
         clock: Callable[[], float],
         incarnation: int,
         body: Body,
         log: Log,
-        lockstep: bool = False,
-        beat: float | None = None,
-        give_up: float = np.inf,
-        report: float = REPORT,
         wall: Callable[[], float] = time.time,
     ) -> None:
-        self.part, self.core, self.transport, self.body, self.clock = part, core, transport, body, clock
+        self.part, self.settings, self.body, self.clock = part, settings, body, clock
         self.membership = Membership(part)
-        self._beat = beat
-        self._filter = self._new_filter()
-        self._halves = {} if beat is None else _half_numbers_of(part, core)
-        self.peers = Peers(
-            part,
-            part.problem(mode, "all" if beat is None else "events"),
-            {neighbour.id: self._expected(neighbour, lockstep=lockstep) for neighbour in part.neighbours},
-            transport,
-            clock,
-            incarnation,
-        )
-        self._log, self._give_up, self._period = log, give_up, report
+        self._use(core)
+        expected = {neighbour.id: self.codec.expected(neighbour) for neighbour in part.neighbours}
+        self.peers = Peers(part, part.problem(settings.mode, settings.sends), expected, transport, clock, incarnation)
+        self._transport, self._log, self._period = transport, log, settings.report
         self.epoch, self._wall = part.epoch, wall
         self._time, self._restarts = 0.0, 0
         self._strange = False
         self._born = clock()
         self._track: list[list[float]] = []
-        self._known: Knowledge = None
+        self.known: Knowledge = None
+        """What the agent knows about the team."""
         self._near = False
         self._down = frozenset(self.peers.all)
         self._next_report = clock()
@@ -99,20 +83,12 @@ class Station:
         self._view: AgentView | None = None
         self.target: np.ndarray | None = None
         """(d,) target of the body; None before the first step."""
-        self.regroup(None, part.first)
+        self.regroup(None)
 
-    def _new_filter(self) -> NewsFilter | None:
-        """The filter of messages for the present core; None if everything is sent."""
-        return None if self._beat is None else NewsFilter(self.core, self._beat)
-
-    def _expected(self, neighbour: Neighbour, *, lockstep: bool) -> Expected:
-        """Expected arrays of a neighbour's messages. The last entry of each row of a link is a membership number."""
-        shares, largest = len(neighbour.shares), self.core.largest
-        pair = self._halves.get(neighbour.id) or (self.core.pair_numbers[neighbour.id],)
-        frame = [Numbers((shares, len(largest) + 1), (*largest.tolist(), LARGEST)), *pair]
-        state = [*frame, *frame, Numbers((1,))] if lockstep else frame
-        found: dict[Kind, Sequence[Numbers | tuple[int, ...]]] = {Kind.HELLO: [(shares,)], Kind.STATE: state, Kind.GOODBYE: []}
-        return found | ({Kind.SAME: [(1,)]} if lockstep and self._beat is not None else {})
+    def _use(self, core: Embodied) -> None:
+        """Make this the core of the agent."""
+        self.core, self.codec = core, Codec(self.part, core, self.membership, self.settings)
+        self._filter = None if self.settings.beat is None else NewsFilter(core, self.settings.beat)
 
     # -- membership --------------------------------------------------------------------------------------------------------------------
 
@@ -121,34 +97,20 @@ class Station:
         """Ids of the neighbours that are present."""
         return [neighbour.id for neighbour in self.core.part.neighbours]
 
-    def regroup(self, state: Any, first: np.ndarray) -> Any:
+    def regroup(self, state: Any) -> Any:
         """Rebuild the core for the agents that are present, and transfer the state to it. Nothing changes if the membership is the same.
-
-        Args:
-            state: the present state; None before the start.
-            first: (copies, d) initial estimates of all agents of the part.
-        """
+        `state`: the present state; None before the start."""
         gone = self.membership.gone
         if gone != self._gone:
             for event, agents in (("left", gone - self._gone), ("joined", self._gone - gone)):
                 if state is not None and agents:
                     self.log(event, agents=sorted(agents))
-            before, self.core = self.core, self.core.without(gone)
-            self._filter = self._new_filter()
+            before = self.core
+            self._use(before.without(gone))
             self._gone, self._view = gone, None
             if state is not None:
-                state = self.core.carry(before, state, self.present_rows(first), self._time)
-        place = {end: k for k, end in enumerate(self.core.ends)}
-        self._places = {
-            neighbour.id: np.array([place.get((neighbour.id, agent), -1) for agent in neighbour.shares])
-            for neighbour in self.part.neighbours
-        }
-        self._turn_of = {neighbour: k for k, neighbour in enumerate(self.present)}
+                state = self.core.carry(before, state, self.first(), self._time)
         return state
-
-    def present_rows(self, first: np.ndarray) -> np.ndarray:
-        """The rows of `first`, (copies, d), that belong to agents that are present."""
-        return first[[agent not in self._gone for agent in self.part.team.ids]]
 
     @property
     def changed(self) -> bool:
@@ -156,11 +118,11 @@ class Station:
         return self.membership.gone != self._gone
 
     def first(self) -> np.ndarray:
-        """(copies, d) initial estimates of all agents of the part, with the measured position for the agent itself."""
-        first = self.part.first.copy()
+        """(rows, d) initial estimates of the agents that are present, with the measured position for the agent itself."""
+        first = self.part.first[[agent not in self._gone for agent in self.part.team.ids]]
         position = self.body.position()
         if position is not None:
-            first[self.part.team.ids.index(self.part.me)] = position
+            first[self.core.part.own] = position
         return first
 
     @property
@@ -169,19 +131,9 @@ class Station:
         return {} if self._view is None else dict(zip(self.core.part.team.ids, self._view.x, strict=True))
 
     @property
-    def satisfied(self) -> bool:
-        """Whether the agent knows that all agents are satisfied."""
-        return self._known == "satisfied"
-
-    @property
-    def known(self) -> Knowledge:
-        """What the agent knows about the team."""
-        return self._known
-
-    @property
     def settled(self) -> bool:
         """Whether the agent knows a final result: all are satisfied, or the team is infeasible and near its best margin."""
-        return self.satisfied or (self._known == "infeasible" and self._near)
+        return self.known == "satisfied" or (self.known == "infeasible" and self._near)
 
     # -- constraints -------------------------------------------------------------------------------------------------------------------
 
@@ -212,9 +164,8 @@ class Station:
             state = state and self.core.without_proofs(state)
         else:
             self.part = replace(self.part, team=changed(team, changes))
-            self.core = before.without(self._gone, self.part)
-            self._filter = self._new_filter()
-            state = state and self.core.carry(before, state, self.present_rows(self.first()), self._time)
+            self._use(before.without(self._gone, self.part))
+            state = state and self.core.carry(before, state, self.first(), self._time)
         self.log("changed", constraint=constraint, parameters=dict(parameters))
         return state
 
@@ -239,53 +190,9 @@ class Station:
         now = self.clock()
         for neighbour in self.present:
             peer = self.peers.all[neighbour]
-            if now - max(peer.heard, self._born) > self._give_up:
+            if now - max(peer.heard, self._born) > self.settings.give_up:
                 self.membership.drop(neighbour)
         return messages
-
-    def blocks(self, outbox: Rows) -> dict[str, list[np.ndarray]]:
-        """The arrays to send to each neighbour.
-
-        Args:
-            outbox: messages of the core.
-
-        Returns:
-            For each neighbour a list of arrays. The first, (shares, width + 1), has the core's row of each shared position, 0 for absent
-            agents, and in the last column the membership number of each agent. The second is the core's row for this neighbour, 0 if it is
-            absent; with ``sends=events`` in mode interior-point it is split in two, see `consat.network.node.pairs.halves`.
-        """
-        arrays = {}
-        for neighbour, place in self._places.items():
-            block = np.zeros((len(place), self.core.width + 1))
-            block[place >= 0, :-1] = outbox.link[place[place >= 0]]
-            block[:, -1] = self.membership.of(self.peers.all[neighbour].known.shares)
-            message, row = np.zeros(self.core.pair_numbers[neighbour].shape), self._turn_of.get(neighbour)
-            if row is not None:
-                message = outbox.pair[row, : len(message)]
-            short = self._halves.get(neighbour)
-            arrays[neighbour] = [block, *([message] if short is None else halves(message, 1 + short[0].shape[0]))]
-        return arrays
-
-    def deliver(self, neighbour: str, arrays: Sequence[np.ndarray], inbox: Rows, arrived: Rows) -> None:
-        """Write a message into the inbox. Rows of links are used where both ends agree on the membership of the shared agent; the row of
-        the neighbour is used where they agree on all shared agents.
-
-        Args:
-            neighbour: id of the sender.
-            arrays: the arrays of the message; see `blocks`.
-            inbox: rows of the messages; modified.
-            arrived: masks of arrival; modified.
-        """
-        block, *pair = arrays
-        message = pair[0] if len(pair) == 1 else whole(*pair)
-        place, row = self._places[neighbour], self._turn_of.get(neighbour)
-        same = block[:, -1] == self.membership.of(self.peers.all[neighbour].known.shares)
-        agrees = (place >= 0) & same
-        inbox.link[place[agrees]] = block[agrees, :-1]
-        arrived.link[place[agrees]] = True
-        if row is not None and same.all():
-            inbox.pair[row, : len(message)] = message
-            arrived.pair[row] = True
 
     def turn(self, state: Any, inbox: Rows, arrived: Rows, moment: Moment) -> tuple[Any, Rows, AgentView]:
         """Compute a step; see `Embodied.turn`. Messages that would make the state NaN or infinite are not used; see `guard`."""
@@ -309,39 +216,27 @@ class Station:
         if self._filter is not None:
             self._filter.resume(rows, np.asarray(state.bodies.position))
 
-    def unchanged(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The message that a neighbour without news would have sent. `arrays`: the arrays of its previous message."""
-        block = arrays[0].copy()
-        for column in self.core.ages:
-            block[:, column] += block[:, column] > 0
-        return [block, *arrays[1:]]
-
-    def send_same(self, round_: np.ndarray, to: Iterable[str]) -> None:
-        """Tell the neighbours `to` that a round brought no news. `round_`: (1,) the round."""
-        for neighbour in to:
-            self.peers.send(neighbour, Kind.SAME, [round_])
+    def send_same(self, round_: np.ndarray, but: AbstractSet[str]) -> None:
+        """Tell all neighbours but those in `but` that a round brought no news. `round_`: (1,) the round."""
+        for neighbour in self._listeners():
+            if neighbour not in but:
+                self.peers.send(neighbour, Kind.SAME, [round_])
 
     def send_hello(self) -> None:
         """Send a greeting, which contains the membership, to the neighbours."""
         for neighbour in self._listeners():
             self.peers.send(neighbour, Kind.HELLO, [self.membership.of(self.peers.all[neighbour].known.shares)])
 
-    def send(self, arrays: Mapping[str, list[np.ndarray]], to: Iterable[str] | None = None, among: AbstractSet[str] | None = None) -> None:
+    def send(self, arrays: Mapping[str, list[np.ndarray]], to: AbstractSet[str] | None = None) -> None:
         """Send a state message.
 
         Args:
-            arrays: see `blocks`.
-            to: ids of the receivers; None for all neighbours that are present.
-            among: send only to receivers in this set; None for no limit.
+            arrays: see `Codec.encode`.
+            to: ids of the receivers; None for all neighbours.
         """
-        for neighbour in self._listeners() if to is None else to:
-            if among is None or neighbour in among:
-                single = [k for k, array in enumerate(arrays[neighbour]) if neighbour in self._halves and k % 3 == 1]
-                self.peers.send(neighbour, Kind.STATE, arrays[neighbour], tuple(single))
-
-    def silent(self, among: AbstractSet[str]) -> list[str]:
-        """The present neighbours that are not in `among`."""
-        return [neighbour for neighbour in self._listeners() if neighbour not in among]
+        for neighbour in self._listeners():
+            if to is None or neighbour in to:
+                self.peers.send(neighbour, Kind.STATE, arrays[neighbour], self.codec.single(arrays[neighbour]))
 
     def send_goodbye(self) -> None:
         """Send a goodbye: the process stops. An agent that leaves for good announces that in earlier messages."""
@@ -366,8 +261,7 @@ class Station:
 
     def delays(self) -> np.ndarray:
         """(E,) half the round-trip time to the neighbour at each end, s; 0 before it is known."""
-        trips = {neighbour: np.nan_to_num(peer.trip) for neighbour, peer in self.peers.all.items()}
-        return np.array([0.5 * trips[neighbour] for neighbour, _ in self.core.ends])
+        return np.array([0.5 * np.nan_to_num(self.peers.all[neighbour].trip) for neighbour, _ in self.core.ends])
 
     def fresh(self, within: float) -> np.ndarray:
         """(E,) whether a message of the neighbour at each end arrived within the last `within` s."""
@@ -394,7 +288,7 @@ class Station:
             view: result of the last step.
             stamp: round or time, s, of the recorded position.
         """
-        self.target = view.x[self._me()]
+        self.target = view.x[self.core.part.own]
         self.body.follow(self.target, self.clock())
         position = self.body.position()
         if position is not None:
@@ -411,28 +305,24 @@ class Station:
             stamp: round or time, s, of the event.
             lately: whether the others were heard recently. If not, the agent does not know where they are.
         """
-        view, before = self._view, (self._known, self._near)
-        self._known, self._near = None, False
+        view, before = self._view, (self.known, self._near)
+        self.known, self._near = None, False
         if view is not None and lately and view.known > 0:
-            self._known = "satisfied"
+            self.known = "satisfied"
         elif view is not None and view.bound < 0:
-            self._known, self._near = "infeasible", lately and view.near
-        if before != (self._known, self._near):
-            if self._known is None:
+            self.known, self._near = "infeasible", lately and view.near
+        if before != (self.known, self._near):
+            if self.known is None:
                 self.log("unsatisfied" if before[0] == "satisfied" else "undecided", stamp=stamp)
-            elif self._known == "satisfied":
+            elif self.known == "satisfied":
                 self.log("satisfied", stamp=stamp)
             elif view is not None:
                 self.log("infeasible", stamp=stamp, near=self._near, bound=view.bound, margin=number(view.least))
 
-    def _me(self) -> int:
-        """The agent's row among the agents that are present."""
-        return self.core.part.team.ids.index(self.part.me)
-
     def watch(self) -> float:
         """Log which neighbours went down or came up, and a report when one is due. Returns the time of the next report, s."""
         now = self.clock()
-        alive = self.peers.alive()
+        alive = self._transport.alive()
         down = frozenset(
             neighbour
             for neighbour, peer in self.peers.all.items()
@@ -461,7 +351,7 @@ class Station:
             estimate_margin = number(self.core.margin(view.x, self._time))
             if view.heard and position is not None:
                 bodies = view.bodies.copy()
-                bodies[self._me()] = position
+                bodies[self.core.part.own] = position
                 margin = number(self.core.margin(bodies, self._time))
         peers = {}
         for neighbour, peer in self.peers.all.items():
@@ -484,10 +374,3 @@ class Station:
             dropped=self.peers.dropped,
         )
         self._track = []
-
-
-def _half_numbers_of(part: Part, core: Embodied) -> dict[str, tuple[Numbers, ...]]:
-    """For each neighbour the formats of the two halves of its row, in mode interior-point; else nothing."""
-    if not isinstance(core.core, PairCore):
-        return {}
-    return {neighbour.id: MessageLayout.of(neighbour, part.team.dimension).half_numbers() for neighbour in part.neighbours}
