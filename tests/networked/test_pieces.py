@@ -159,7 +159,7 @@ def test_absurd_numbers_of_members_are_ignored(told: float) -> None:
 def test_a_simulated_body_moves_straight_and_no_faster_than_allowed() -> None:
     body = SimulatedBody(np.zeros(2), speed=2.0)
     body.follow(np.array([3.0, 4.0]), 0.0)
-    np.testing.assert_allclose(body.follow(np.array([3.0, 4.0]), 0.5), [1.2, 1.6])
+    body.follow(np.array([3.0, 4.0]), 0.5)
     np.testing.assert_allclose(body.position(), [0.6, 0.8])
     body.follow(np.array([3.0, 4.0]), 10.0)
     np.testing.assert_allclose(body.position(), [3.0, 4.0])
@@ -167,11 +167,11 @@ def test_a_simulated_body_moves_straight_and_no_faster_than_allowed() -> None:
 
 def test_a_measured_body_stands_still_until_it_is_measured() -> None:
     body = MeasuredBody(speed=1.0)
-    assert body.follow(np.ones(2), 0.0).tolist() == [0.0, 0.0]
+    assert body.command(np.ones(2), 0.0).tolist() == [0.0, 0.0]
     assert body.measure(Measurement(np.array([1.0, 0.9]), 1.0)) is None
-    np.testing.assert_allclose(body.follow(np.ones(2), 1.0), [0.0, 0.2])  # 0.1 in 0.5 s
+    np.testing.assert_allclose(body.command(np.ones(2), 1.0), [0.0, 0.2])  # 0.1 in 0.5 s
     assert body.measure(Measurement(np.array([1.0, -0.5]), 2.0)) is None
-    np.testing.assert_allclose(body.follow(np.ones(2), 2.0), [0.0, 1.0])
+    np.testing.assert_allclose(body.command(np.ones(2), 2.0), [0.0, 1.0])
 
 
 def sightings(body: MeasuredBody, *record: tuple[float, float] | tuple[float, float, float]) -> list[bool]:
@@ -223,10 +223,10 @@ def test_a_body_that_is_not_measured_any_more_stands() -> None:
     sightings(body, (0.0, 0.0), (0.1, 90.0))
     assert body.sensed(0.5)
     assert not body.sensed(0.51), "what is not believed is no measurement"
-    assert body.follow(np.array([5.0, 0.0]), 0.5).tolist() == [1.0, 0.0]
-    assert body.follow(np.array([5.0, 0.0]), 0.51).tolist() == [0.0, 0.0]
+    assert body.command(np.array([5.0, 0.0]), 0.5).tolist() == [1.0, 0.0]
+    assert body.command(np.array([5.0, 0.0]), 0.51).tolist() == [0.0, 0.0]
     sightings(body, (0.6, 0.2))
-    assert body.follow(np.array([5.0, 0.0]), 0.6).tolist() == [1.0, 0.0]
+    assert body.command(np.array([5.0, 0.0]), 0.6).tolist() == [1.0, 0.0]
 
 
 # -- modes and environment ---------------------------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def test_two_unicycles_pass_each_other_and_an_obstacle_each_by_itself() -> None:
         now, i = 10.0 + TICK * tick, tick % 2
         seen = Measurement(poses[i][:2], now, None, poses[i][2], poses[1 - i][None, :2])
         assert bodies[i].measure(seen) is None
-        commands[i] = bodies[i].named(bodies[i].follow(goals[i], now))
+        commands[i] = bodies[i].named(bodies[i].command(goals[i], now))
         poses = [moved(pose, command["v"], command["omega"], TICK) for pose, command in zip(poses, commands, strict=True)]
         turned = max(turned, *(abs(command["omega"]) for command in commands))
         gap = min(gap, float(np.linalg.norm(poses[0][:2] - poses[1][:2])) - 0.2)
@@ -51,15 +51,15 @@ def test_a_robot_stands_where_it_is_not_measured_and_says_what_is_missing() -> N
     body = RobotBody(Robots(cs.Unicycle()), 2, 0.5)
     target = np.array([1.0, 0.0])
     assert body.valid == HELD
-    assert body.named(body.follow(target, 0.0)) == {"v": 0.0, "omega": 0.0}
+    assert body.named(body.command(target, 0.0)) == {"v": 0.0, "omega": 0.0}
     here = np.zeros(2)
     assert "heading is missing" in str(body.measure(Measurement(here, 1.0, None, None, np.zeros((0, 2)))))
     assert "neighbours is missing" in str(body.measure(Measurement(here, 1.0, None, 0.0)))
     assert body.measure(Measurement(here, 1.0, None, 0.0, np.zeros((0, 2)))) is None
-    assert body.named(body.follow(target, 1.1))["v"] == pytest.approx(0.5)
-    assert body.named(body.follow(target, 1.6)) == {"v": 0.0, "omega": 0.0}
+    assert body.named(body.command(target, 1.1))["v"] == pytest.approx(0.5)
+    assert body.named(body.command(target, 1.6)) == {"v": 0.0, "omega": 0.0}
     assert body.measure(Measurement(here, 2.0, None, 0.0, np.array([[0.31, 0.0]]))) is None
-    assert body.named(body.follow(target, 2.0))["v"] * HELD <= 0.25 * (0.31 - 0.2), (
+    assert body.named(body.command(target, 2.0))["v"] * HELD <= 0.25 * (0.31 - 0.2), (
         "half of its half of the gap: others may have begun to move"
     )
     with pytest.raises(InvalidSettings, match="a double cannot halt at once; on a network point and unicycle are driven"):

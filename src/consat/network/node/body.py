@@ -27,15 +27,15 @@ class Body(Protocol):
         """Whether the position is known at the time `now`, s."""
         ...
 
-    def follow(self, target: np.ndarray, now: float) -> np.ndarray:
-        """Move towards `target`, (d,). `now`: time, s. Returns the commanded velocity, (d,), length/s."""
+    def follow(self, target: np.ndarray, now: float) -> None:
+        """Move towards `target`, (d,), if the body is simulated. `now`: time, s."""
         ...
 
 
-def limited(velocity: np.ndarray, speed: float) -> np.ndarray:
-    """The velocity, (d,), scaled down to at most `speed`."""
-    size = float(np.linalg.norm(velocity))
-    return velocity * (speed / size) if size > speed else velocity
+def limited(vector: np.ndarray, most: float) -> np.ndarray:
+    """The vector, (d,), scaled down to at most the length `most`."""
+    size = float(np.linalg.norm(vector))
+    return vector * (most / size) if size > most else vector
 
 
 class SimulatedBody:
@@ -57,17 +57,12 @@ class SimulatedBody:
     def sensed(self, now: float) -> bool:
         return True
 
-    def follow(self, target: np.ndarray, now: float) -> np.ndarray:
+    def follow(self, target: np.ndarray, now: float) -> None:
         elapsed, self._last = (0.0 if self._last is None else now - self._last), now
         if not np.isfinite(self._speed):
-            step = target - self._position
             self._position = target.copy()
-            return step / elapsed if elapsed > 0 else np.zeros_like(target)
-        if elapsed <= 0:
-            return np.zeros_like(target)
-        velocity = limited((target - self._position) / elapsed, self._speed)
-        self._position = self._position + velocity * elapsed
-        return velocity
+        elif elapsed > 0:
+            self._position = self._position + limited(target - self._position, self._speed * elapsed)
 
 
 class Measurement(NamedTuple):
@@ -89,7 +84,7 @@ class Measurement(NamedTuple):
 
 
 class MeasuredBody:
-    """A real body: its position is measured externally, and the result of `follow` is sent to it as a command.
+    """A real body: its position is measured externally, and `Commander` sends it the result of `command`.
 
     A measurement is rejected if it is inconsistent with the last good one, by its stamp or by its distance. After `CONFIRMED` consecutive
     measurements that are consistent with each other the new position is accepted: the body was moved. Smaller stamps are accepted only
@@ -143,7 +138,11 @@ class MeasuredBody:
     def sensed(self, now: float) -> bool:
         return self._good is not None and now - self._good.time <= self._timeout
 
-    def follow(self, target: np.ndarray, now: float) -> np.ndarray:
+    def follow(self, target: np.ndarray, now: float) -> None:
+        """Does nothing: the body is commanded, see `consat.network.node.commander`."""
+
+    def command(self, target: np.ndarray, now: float) -> np.ndarray:
+        """The command, (m,), that moves the body towards `target`, (d,); to stop if its position is unknown. `now`: time, s."""
         if self._good is None or not self.sensed(now):
             return np.zeros_like(target)
         return limited((target - self._good.position) / LAG, self._speed)

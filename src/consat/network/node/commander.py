@@ -56,7 +56,7 @@ class Commander:
             self._log("unmeasured" if lost else "measured")
             self._complain(f"has no measurement for {self._timeout:g} s, and stands" if lost else "is measured again")
         self._target, self._due = target, now + PERIOD
-        self._command(self._still if target is None or self._over else self._body.follow(target, now))
+        self._command(self._still if target is None or self._over else self._body.command(target, now))
 
     def halt(self) -> None:
         """Command the body to stop; all later commands are to stop, too."""

@@ -80,7 +80,7 @@ class RobotBody(MeasuredBody):
             self._heading, self._near, self._middle = heading, others, middle
         return why
 
-    def follow(self, target: np.ndarray, now: float) -> np.ndarray:
+    def command(self, target: np.ndarray, now: float) -> np.ndarray:
         if self._good is None or not self.sensed(now):
             return np.zeros_like(target)
         elapsed, self._last = min(max(now - self._last, 0.0), HELD), now

@@ -282,7 +282,7 @@ class Station:
         self._log({"event": event, "id": self.part.me, "t": self.clock(), **details})
 
     def move(self, view: AgentView, stamp: float) -> None:
-        """Command the body towards the agent's estimate, record its position, and log what is new.
+        """Set the body's target to the agent's estimate, record its position, and log what is new.
 
         Args:
             view: result of the last step.
