@@ -10,7 +10,8 @@ import numpy as np
 
 from consat.errors import Fault, shown
 from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
-from consat.problem.family import Derived, FamilyPart, Repeated
+from consat.problem.entries import Entry, trace, wrong_name
+from consat.problem.family import Derived, Family
 from consat.problem.groups import ACROSS, OTHER, PLACE, SELF, Each, Group, Ints, Layout, label, layout
 from consat.problem.parameters import Path, checked, checked_rows
 from consat.problem.schedule import Schedule, Track
@@ -43,19 +44,24 @@ class Expansion:
     def __post_init__(self) -> None:
         self.layout = layout(self.group, self.dimension)
 
-    def parts(self) -> list[tuple[FamilyPart, Constraint, Path, str]]:
-        """For each constraint of the group: the part with one row per owner, the constraint, and its place in the input, for faults."""
-        made: list[tuple[FamilyPart, Constraint, Path, str]] = []
-        named: dict[str, Path] = {}
-        for path, entry in self.entries():
-            constraint = entry.constraint
+    def parts(self) -> list[tuple[Family, Sequence[str]]]:
+        """For each constraint of the group that a member owns: the family with one row per owner, and the names."""
+        made: list[tuple[Family, Entry]] = []
+        taken: set[str] = set()
+        for path, each in self.entries():
+            constraint = each.constraint
             where = f"{label(self.group)}, constraint {constraint.name or constraint.kind!r}"
-            if constraint.name is not None and not self.good_name(constraint.name, named, path, where):
-                continue
-            part = self.part(entry, path, where)
-            if part is not None:
-                made.append((part, constraint, path, where))
-        return self.told_apart(made)
+            if constraint.name is not None:
+                if message := wrong_name(constraint.name, taken, label(self.group)):
+                    self.faults.append(Fault((*path, "name"), message, where))
+                    continue
+                taken.add(constraint.name)
+            family = self.family(each, path, where)
+            if family is not None and family.size:
+                first = {key: value[0] for key, value in family.parameters.items()}
+                made.append((family, Entry(constraint, self.first, tuple(range(family.arity)), "", path, where, first)))
+        trace((entry for _, entry in made), self.dimension, self.faults)
+        return self.named([(family, entry.constraint) for family, entry in made])
 
     def entries(self) -> Iterator[tuple[Path, Each]]:
         """(path, constraint with its owners) for each constraint of the group; nested lists are flattened."""
@@ -71,23 +77,11 @@ class Expansion:
                     message = f"{constraint!r} is no constraint; use consat.within and its like"
                     self.faults.append(Fault(path, message, label(self.group)))
 
-    def good_name(self, name: Any, named: dict[str, Path], path: Path, where: str) -> bool:
-        """Whether a given name is valid and new in the group. Adds it to `named`, or a fault."""
-        if not isinstance(name, str) or not name.strip() or not name.isprintable():
-            self.faults.append(Fault((*path, "name"), f"name is {shown(name)}, but must be a printable text", where))
-        elif name in named:
-            message = f"name {name!r} is taken by another constraint of {label(self.group)}; choose another"
-            self.faults.append(Fault((*path, "name"), message, where))
-        else:
-            named[name] = path
-            return True
-        return False
-
-    def part(self, entry: Each, path: Path, where: str) -> FamilyPart | None:
-        """The part for one constraint of the group, with one row per owner and agent read, without names; None if it has faults."""
-        constraint, known = entry.constraint, len(self.faults)
-        rows = self.members(entry.of, path, where)
-        slots = self.slots(constraint, entry.agent, path, where)
+    def family(self, each: Each, path: Path, where: str) -> Family | None:
+        """The family of one constraint of the group, with one row per owner and agent read, not numbered; None if it has faults."""
+        constraint, known = each.constraint, len(self.faults)
+        rows = self.members(each.of, path, where)
+        slots = self.slots(constraint, each.agent, path, where)
         if len(self.faults) > known:
             return None
         row, other = self.related(slots.relation, rows, path, where)
@@ -106,15 +100,15 @@ class Expansion:
             self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
         if len(self.faults) > known or isinstance(weight, Schedule):
             return None
-        return FamilyPart(
+        return Family(
             kind=constraint.kind,
             psi=constraint.psi,
             agents=np.stack(columns, axis=1).astype(np.int32),
             owner=(row + self.first).astype(np.int32),
+            number=np.zeros(len(row), dtype=np.int32),
             parameters=values,
             weight=weight,
-            names=(),
-            sources=None if constraint.source is None else Repeated(constraint.source, len(row)),
+            sources=None if constraint.source is None else (constraint.source,) * len(row),
             tracks=tracks if len(row) else {},
         )
 
@@ -259,28 +253,24 @@ class Expansion:
             return one
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
 
-    def told_apart(self, made: list[tuple[FamilyPart, Constraint, Path, str]]) -> list[tuple[FamilyPart, Constraint, Path, str]]:
-        """The same list with names. A name that one owner would have twice gets a number."""
+    def named(self, made: list[tuple[Family, Constraint]]) -> list[tuple[Family, Sequence[str]]]:
+        """The families, numbered by their order in the group, with names. A name that one owner would have twice gets a number."""
         stems: dict[str, list[int]] = {}
         others = []
-        for p, (part, constraint, _, _) in enumerate(made):
-            reads = part.agents if constraint.name is None else part.agents[:, :0]
-            others.append(_others(reads, part.owner))
+        for p, (family, constraint) in enumerate(made):
+            reads = family.agents if constraint.name is None else family.agents[:, :0]
+            others.append(_others(reads, family.owner))
             stems.setdefault(constraint.name or f"{constraint.kind}({others[p].shape[1]})", []).append(p)
-        named = list(made)
+        names: dict[int, Sequence[str]] = {}
         for parts in stems.values():
             owner = np.concatenate([made[p][0].owner for p in parts])
-            keys = [owner, *np.concatenate([others[p] for p in parts]).T]
-            rank, start = _ranks(keys), 0
-            for p in parts:
-                part, constraint, path, where = made[p]
-                stop = start + len(part.owner)
-                ids = self.ids if constraint.name is None else None
-                mine = rank[start:stop] if rank is not None else None
-                names = Derived(constraint.name or constraint.kind, ids, others[p], mine)
-                named[p] = replace(part, names=names), constraint, path, where
-                start = stop
-        return named
+            rank = _ranks([owner, *np.concatenate([others[p] for p in parts]).T])
+            ends = np.cumsum([len(others[p]) for p in parts])[:-1]
+            mine = [None] * len(parts) if rank is None else np.split(rank, ends)
+            for p, again in zip(parts, mine, strict=True):
+                constraint = made[p][1]
+                names[p] = Derived(constraint.name or constraint.kind, self.ids if constraint.name is None else None, others[p], again)
+        return [(replace(family, number=family.number + p), names[p]) for p, (family, _) in enumerate(made)]
 
 
 def _fixed(parameter: Any) -> bool:

@@ -79,110 +79,59 @@ class Family:
         return int(self.agents.shape[1])
 
 
-@dataclass(frozen=True, eq=False)
-class FamilyPart:
-    """M constraints to be merged into a `Family` by `assemble`; not yet numbered.
+def assemble(parts: Sequence[tuple[Family, Sequence[str]]]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
+    """Merges families that have the same function and the same shapes of parameters, and numbers the constraints by owner.
 
-    Attributes:
-        kind: as in `Family`.
-        psi: as in `Family`.
-        agents: as in `Family`.
-        owner: as in `Family`.
-        parameters: as in `Family`.
-        weight: as in `Family`.
-        names: (M,) what reports call the constraints.
-        sources: as in `Family`.
-        turn: (M,) position of each constraint in the input, counted over all parts with a `turn`. Constraints of one owner keep this order.
-            Parts without it (None) come after the others, in the order of the parts.
-        tracks: as in `Family`.
-    """
-
-    kind: str
-    psi: Callable[..., Any]
-    agents: np.ndarray
-    owner: np.ndarray
-    parameters: Mapping[str, np.ndarray]
-    weight: np.ndarray
-    names: Sequence[str]
-    sources: Sequence[str] | None = None
-    turn: np.ndarray | None = None
-    tracks: Mapping[str, Track] = field(default_factory=dict)
-
-    @property
-    def family(self) -> tuple[Any, ...]:
-        """Key of the family: the function, the number of positions, and the shapes of the parameters."""
-        shapes = tuple((key, value.shape[1:]) for key, value in sorted(self.parameters.items()))
-        return self.psi, self.agents.shape[1], shapes
-
-
-def assemble(parts: Sequence[FamilyPart]) -> tuple[tuple[Family, ...], np.ndarray, Sequence[str]]:
-    """Merges parts into families and numbers the constraints by owner.
+    Args:
+        parts: families, each with the (M,) names of its constraints. Their `number` is a rank, by which the constraints of one owner are
+            sorted; it may have gaps.
 
     Returns:
         the families, the (M,) owners and the (M,) names, both in the team's order.
     """
-    parts = sorted(parts, key=lambda part: part.turn is None)
-    owner = np.concatenate([np.zeros(0, dtype=np.int32), *(part.owner for part in parts)])
-    order = _order(parts, owner)
-    number = np.arange(len(owner), dtype=np.int32)
-    if order is not None:
-        number[order] = number.copy()
-    names = Chosen(Joined([part.names for part in parts]), order)
-    stops = np.cumsum([0, *(len(part.owner) for part in parts)])
-    alike: dict[tuple[Any, ...], list[int]] = {}
-    for p, part in enumerate(parts):
-        alike.setdefault(part.family, []).append(p)
-    families = []
-    for members in alike.values():
-        group, first = [parts[p] for p in members], parts[members[0]]
-        texts = [part.sources for part in group if part.sources is not None]
-        families.append(
-            Family(
-                kind=first.kind,
-                psi=first.psi,
-                agents=_joined([part.agents for part in group]),
-                owner=_joined([part.owner for part in group]),
-                number=_joined([number[stops[p] : stops[p + 1]] for p in members]),
-                parameters={key: _joined([part.parameters[key] for part in group]) for key in first.parameters},
-                weight=_joined([part.weight for part in group]),
-                sources=Joined(texts) if len(texts) == len(group) else None,
-                tracks=_tracks(group),
-            )
-        )
-    return tuple(families), owner if order is None else owner[order], names
-
-
-def _tracks(parts: Sequence[FamilyPart]) -> dict[str, Track]:
-    """The tracks of parts that become one family, joined."""
-    starts = np.cumsum([0, *(len(part.owner) for part in parts)]).tolist()
-    found: dict[str, list[tuple[Track, int]]] = {}
-    for part, start in zip(parts, starts, strict=False):
-        for key, track in part.tracks.items():
-            found.setdefault(key, []).append((track, start))
     nothing = np.zeros(0, dtype=np.int32)
-    return {
-        key: Track(nothing, many[0][0].times[:0], many[0][0].values[:0]).joined(many) if many[0][1] or len(many) > 1 else many[0][0]
-        for key, many in found.items()
+    owner = np.concatenate([nothing, *(family.owner for family, _ in parts)])
+    rank = np.concatenate([nothing, *(family.number for family, _ in parts)])
+    order = np.lexsort((rank, owner)).astype(np.int32)
+    number = np.empty(len(owner), dtype=np.int32)
+    number[order] = np.arange(len(owner))
+    starts = np.cumsum([0, *(family.size for family, _ in parts)])
+    alike: dict[tuple[Any, ...], list[Family]] = {}
+    for start, (family, _) in zip(starts, parts, strict=False):
+        shapes = tuple((key, value.shape[1:]) for key, value in sorted(family.parameters.items()))
+        numbered = replace(family, number=number[start : start + family.size])
+        alike.setdefault((family.psi, family.arity, shapes), []).append(numbered)
+    return tuple(map(_merged, alike.values())), owner[order], Chosen(Joined([names for _, names in parts]), order)
+
+
+def _merged(parts: Sequence[Family]) -> Family:
+    """The constraints of several families with one function, as one family."""
+    if len(parts) == 1:
+        return parts[0]
+    first = parts[0]
+    texts = [part.sources for part in parts if part.sources is not None]
+    starts = np.cumsum([0, *(part.size for part in parts)]).tolist()
+    moving = {
+        key: [(part.tracks[key], start) for part, start in zip(parts, starts, strict=False) if key in part.tracks]
+        for key in first.parameters
     }
+    return Family(
+        kind=first.kind,
+        psi=first.psi,
+        agents=np.concatenate([part.agents for part in parts]),
+        owner=np.concatenate([part.owner for part in parts]),
+        number=np.concatenate([part.number for part in parts]),
+        parameters={key: np.concatenate([part.parameters[key] for part in parts]) for key in first.parameters},
+        weight=np.concatenate([part.weight for part in parts]),
+        sources=Joined(texts) if len(texts) == len(parts) else None,
+        tracks={key: Track.joined(tracks) for key, tracks in moving.items() if tracks},
+    )
 
 
 def _written(values: np.ndarray, rows: np.ndarray, new: Any) -> np.ndarray:
     changed = np.array(values, dtype=float)
     changed[rows] = new
     return changed
-
-
-def _order(parts: Sequence[FamilyPart], owner: np.ndarray) -> np.ndarray | None:
-    """(M,) permutation that sorts the constraints by owner and then by `turn`; None if they are sorted already."""
-    turns = [part.turn for part in parts if part.turn is not None]
-    first = np.argsort(np.concatenate(turns)) if turns else np.zeros(0, dtype=np.intp)
-    order = np.concatenate([first, np.arange(len(first), len(owner))])
-    order = order[np.argsort(owner[order], kind="stable")].astype(np.int32)
-    return None if np.array_equal(order, np.arange(len(order))) else order
-
-
-def _joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def distinct(keys: np.ndarray) -> np.ndarray:
@@ -250,29 +199,16 @@ class Joined(Texts):
 
 
 class Chosen(Texts):
-    """Selected entries of a sequence: `of[order[0]]`, `of[order[1]]`, …; all of them if `order` is None."""
+    """Selected entries of a sequence: `of[order[0]]`, `of[order[1]]`, …"""
 
-    def __init__(self, of: Sequence[str], order: np.ndarray | None) -> None:
+    def __init__(self, of: Sequence[str], order: np.ndarray) -> None:
         self.of, self.order = of, order
 
     def __len__(self) -> int:
-        return len(self.of) if self.order is None else len(self.order)
+        return len(self.order)
 
     def text(self, index: int) -> str:
-        return self.of[index if self.order is None else int(self.order[index])]
-
-
-class Repeated(Texts):
-    """One text, repeated `count` times."""
-
-    def __init__(self, each: str, count: int) -> None:
-        self.each, self.size = each, count
-
-    def __len__(self) -> int:
-        return self.size
-
-    def text(self, index: int) -> str:
-        return self.each
+        return self.of[int(self.order[index])]
 
 
 class Counted(Texts):

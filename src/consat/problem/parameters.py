@@ -176,6 +176,11 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
+def is_printable(value: Any) -> bool:
+    """Whether `value` is a text that can be shown: an id or a name."""
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
 def number(parameter: Number, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
     """The value of a scalar parameter as an array of shape (); None, and a fault, if it is not valid."""
     value = parameter.value

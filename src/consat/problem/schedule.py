@@ -84,17 +84,17 @@ class Track(NamedTuple):
         low, high = values[row, k], values[row, after]
         return low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low)
 
-    def joined(self, more: Sequence[tuple[Track, int]]) -> Track:
-        """This track joined with others.
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Track, int]]) -> Track:
+        """Several tracks as one.
 
         Args:
-            more: pairs of a track and the offset to add to its rows.
+            parts: pairs of a track and the offset to add to its rows.
         """
-        tracks = [self, *(track for track, _ in more)]
-        most = max(track.times.shape[1] for track in tracks)
-        padded = [_padded(track.times, track.values, most) for track in tracks]
-        rows = np.concatenate([self.rows, *(track.rows + np.int32(offset) for track, offset in more)])
-        return Track(rows, *(np.concatenate(column) for column in zip(*padded, strict=True)))
+        most = max(track.times.shape[1] for track, _ in parts)
+        padded = [_padded(track.times, track.values, most) for track, _ in parts]
+        rows = np.concatenate([track.rows + np.int32(offset) for track, offset in parts])
+        return cls(rows, *(np.concatenate(column) for column in zip(*padded, strict=True)))
 
     def chosen(self, rows: np.ndarray) -> Track | None:
         """The track of a subset of the constraints, renumbered from 0; None if none of them moves.

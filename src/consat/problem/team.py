@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import cast
@@ -12,9 +13,9 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam, shown
 from consat.problem.agent import Agent
 from consat.problem.constraints.record import OWNER, Constraint, Fixed
-from consat.problem.entries import Entry, alike, entries_of, trace
+from consat.problem.entries import alike, entries_of, trace
 from consat.problem.expansion import Expansion
-from consat.problem.family import Chosen, Family, FamilyPart, assemble
+from consat.problem.family import Chosen, Family, assemble
 from consat.problem.groups import Group
 from consat.problem.index import Index, who_is
 from consat.problem.links import Links, pairs_of, topology, unique
@@ -104,7 +105,7 @@ class Team:
             self.names = tuple(self.names)
         self.links = unique(pairs, self.count) if pairs is not None else topology(cast(str, links), self.count, self.families)
 
-    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[FamilyPart]:
+    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[tuple[Family, Sequence[str]]]:
         expansion = Expansion(group, first, index.ids, index.get, self.dimension, path, faults)
         mine = slice(first, first + group.count)
         if group.start is not None:
@@ -113,14 +114,7 @@ class Team:
             if self.around is None:
                 self.around = np.full_like(self.starts, np.nan), np.full(len(self.starts), np.nan)
             self.around[0][mine], self.around[1][mine] = expansion.layout.places, group.scatter
-        made = expansion.parts()
-        entries = [
-            Entry(constraint, first, tuple(range(part.agents.shape[1])), "", at, where, {k: v[0] for k, v in part.parameters.items()})
-            for part, constraint, at, where in made
-            if len(part.owner)
-        ]
-        trace(entries, self.dimension, faults)
-        return [part for part, *_ in made if len(part.owner)]
+        return expansion.parts()
 
     def _copied(self) -> Team:
         """A copy without what was computed of the constraints and agents, which are to be replaced."""
@@ -206,30 +200,18 @@ class Team:
         """
         place = np.full(self.count, -1, dtype=np.int32)
         place[agents] = np.arange(len(agents), dtype=np.int32)
-        parts, numbers = [], [np.zeros(0, dtype=np.int32)]
-        for family in self.families:
-            kept = family.members((place[family.agents] >= 0).all(axis=1))
-            numbers.append(kept.number)
-            parts.append(
-                FamilyPart(
-                    kind=family.kind,
-                    psi=family.psi,
-                    agents=place[kept.agents],
-                    owner=place[kept.owner],
-                    parameters=kept.parameters,
-                    weight=kept.weight,
-                    names=Chosen(self.names, kept.number),
-                    sources=kept.sources,
-                    turn=kept.number,
-                    tracks=kept.tracks,
-                )
-            )
+        kept = [family.members((place[family.agents] >= 0).all(axis=1)) for family in self.families]
+        parts = [
+            (dataclasses.replace(each, agents=place[each.agents], owner=place[each.owner]), Chosen(self.names, each.number))
+            for each in kept
+            if each.size
+        ]
         team = self._copied()
         team.ids, team.starts, team.members, team.around = Chosen(self.ids, agents), self.starts[agents], None, None
-        team.families, team.owner, team.names = assemble([part for part in parts if len(part.owner)])
+        team.families, team.owner, team.names = assemble(parts)
         links = place[self.links]
         team.links = links[(links >= 0).all(axis=1)]
-        return team, np.sort(np.concatenate(numbers))
+        return team, np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(each.number for each in kept)]))
 
     @property
     def count(self) -> int:
