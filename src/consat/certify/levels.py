@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from consat.certify.quadratics import Block, Expansion, Floats, Ints, tangents
+from consat.certify.quadratics import Block, Expansion, Floats, Ints, columns_of, tangents
 from consat.problem.team import Team
 
 MOST_POLYTOPES = 2000
@@ -129,7 +129,7 @@ def with_tangents(team: Team, model: Expansion, lower: Floats, curved: NDArray[n
         members = curved[family.number]
         if not members.any() or family.arity > 2:
             continue
-        columns = (family.agents[members].astype(np.intp)[:, :, None] * dimension + np.arange(dimension)).reshape(members.sum(), -1)
+        columns = columns_of(team)[f][members]
         for shift in shifts:
             arguments = model.at[family.agents]
             arguments[:, 0] += shift
@@ -280,11 +280,7 @@ def _ellipsoid(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
     At a better formation each ψ_k is at least L, so the sum is at least L times the sum of the weights. If the sum is strictly concave,
     such formations lie in an ellipsoid.
     """
-    weights, gap = np.zeros(len(model.value)), np.zeros(len(model.value))
-    for block in model.blocks:
-        norm = np.linalg.norm(block.hessian, axis=(1, 2))
-        weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
-        gap[block.number] = np.maximum(model.value[block.number] - lower[block.number], 0.0)
+    weights, gap = model.inverse_bend(), np.maximum(model.value - lower, 0.0)
     reach = np.full(model.at.shape[0], np.inf)
     bend, slope = -model.hessian(weights).toarray(), model.gradient(weights).ravel()
     home = np.full(len(weights), -1)

@@ -98,21 +98,13 @@ def middle(team: Team) -> Floats:
     usable = shape.quadratic & shape.concave
     for _ in range(2):  # the second pass recovers digits lost if the first began far away
         model = expand(team, x).keep(usable)
-        weights = _inverse_bend(model)
+        weights = model.inverse_bend()
         bend = -model.hessian(weights)
         damping = 1e-9 * np.maximum(bend.diagonal(), 1.0)
         curved = bend.diagonal() > 0
         step = splu((bend + eye_array(model.size) * damping.max()).tocsc()).solve(np.where(curved, model.gradient(weights).ravel(), 0.0))
         x = x + np.where(curved, step, 0.0).reshape(x.shape)
     return x
-
-
-def _inverse_bend(model: Expansion) -> Floats:
-    weights = np.zeros(len(model.value))
-    for block in model.blocks:
-        norm = np.linalg.norm(block.hessian, axis=(1, 2))
-        weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
-    return weights
 
 
 def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
@@ -175,28 +167,20 @@ def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: 
     count = max(1, min(wanted, MOST_VALUES // max(len(team.owner), 1)))
     formations, margins = climb(team, np.concatenate([first[None], drawn(team, count - 1, seed, size)]), cluster, size)
     order = np.argsort(-margins, axis=0, kind="stable")
-    best: tuple[Floats, Floats, Floats, Bools] | None = None
+    x, multipliers = first, np.zeros(len(team.owner))
+    best, converged = np.full(margins.shape[1], -np.inf), np.zeros(margins.shape[1], dtype=bool)
     for rank in range(min(1 if concave else POLISHED, count)):
-        x = formations[order[rank][cluster], np.arange(team.count)]
-        polished, multipliers, settled = _polish(team, cluster, x)
+        polished, weights, settled = _polish(team, cluster, formations[order[rank][cluster], np.arange(team.count)])
         reached = cluster_margins(team, values_and_gradients(team, polished)[0], cluster)
-        if best is None:
-            best = polished, multipliers, reached, settled
-            continue
-        gained = reached > best[2]
-        best = (
-            np.where(gained[cluster][:, None], polished, best[0]),
-            np.where(gained[cluster[team.owner]], multipliers, best[1]),
-            np.maximum(reached, best[2]),
-            np.where(gained, settled, best[3]),
-        )
-    assert best is not None
+        gained = (reached > best) | (rank == 0)
+        x, multipliers = np.where(gained[cluster][:, None], polished, x), np.where(gained[cluster[team.owner]], weights, multipliers)
+        best, converged = np.where(gained, reached, best), np.where(gained, settled, converged)
     found = f"best of {count} starts, ν-continuation and sequential cone programs (Clarabel)"
     if not concave:
-        return Optimum(best[0], float(best[2].min()), best[1], found, exact=False)
-    exact = bool(best[3].all() and (best[2] > -np.inf).all())
+        return Optimum(x, float(best.min()), multipliers, found, exact=False)
+    exact = bool(converged.all() and (best > -np.inf).all())
     note = "concave constraints: exact" if exact else "concave constraints, not converged"
-    return Optimum(best[0], float(best[2].min()), best[1], f"{note}, {found}", exact=exact)
+    return Optimum(x, float(best.min()), multipliers, f"{note}, {found}", exact=exact)
 
 
 def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools]:

@@ -45,6 +45,14 @@ def clusters(team: Team) -> np.ndarray:
     return _components(_reads(team), team.count)
 
 
+def members(team: Team, cluster: np.ndarray) -> list[list[str]]:
+    """The ids of the agents of each cluster. `cluster`: (N,) as `clusters` returns."""
+    found: list[list[str]] = [[] for _ in range(int(cluster.max(initial=-1)) + 1)]
+    for agent, label in zip(team.ids, cluster.tolist(), strict=True):
+        found[label].append(agent)
+    return found
+
+
 def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
     """(L', 2) int32 links whose two ends are in the same cluster."""
     return team.links[cluster[team.links[:, 0]] == cluster[team.links[:, 1]]]
