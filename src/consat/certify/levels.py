@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from consat.certify.quadratics import Block, Expansion, Floats, Ints, columns_of, tangents
+from consat.problem.graphs import components
 from consat.problem.team import Team
 
 MOST_POLYTOPES = 2000
@@ -222,7 +223,7 @@ def _together(walls: _Planes, pair: Ints, reach: Floats, paths: Floats) -> Float
     count = len(paths)
     tied = pair[:, 0] != pair[:, 1]
     graph = _graph(pair[tied], reach[tied], count)
-    part = connected_components(graph, directed=False)[1]
+    part = components(pair[tied], count)
     own = walls.pair[:, 0] == walls.pair[:, 1]
     where, normal, height = walls.pair[own, 0], walls.normal[own], walls.height[own]
     sizes = np.linalg.norm(normal, axis=1)

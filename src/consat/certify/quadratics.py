@@ -78,10 +78,7 @@ def shape_of(team: Team) -> Shape:
 
 def _hessians(family: Family, dimension: int) -> Floats:
     constant = hessians(family.psi, family.arity, dimension, family.lasting, family.size)
-    alike = np.all(family.weight == family.weight[0])
-    if alike and family.weight[0] == 1.0:
-        return constant
-    return constant * family.weight[:, None, None]
+    return constant if (family.weight == 1.0).all() else constant * family.weight[:, None, None]
 
 
 @dataclass(frozen=True)

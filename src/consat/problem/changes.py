@@ -61,7 +61,7 @@ def changes_of(
 def is_structural(team: Team, changes: Sequence[Change]) -> bool:
     """Whether a change affects a weight, a schedule, or a parameter that moves with time. Rounds must then be compiled again."""
     return any(
-        key == "weight" or isinstance(value, Schedule) or _moves(team.families[change.family], key, change.member)
+        key == "weight" or isinstance(value, Schedule) or isinstance(parameter(team, change.number, key), Schedule)
         for change in changes
         for key, value in change.given.items()
     )
@@ -183,8 +183,3 @@ def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) 
     if faults:
         raise InvalidTeam(faults)
     return values
-
-
-def _moves(family: Family, key: str, member: int) -> bool:
-    track = family.tracks.get(key)
-    return track is not None and track.schedule(int(member)) is not None

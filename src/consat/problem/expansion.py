@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from consat.errors import Fault, shown
 from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
 from consat.problem.entries import Entry, trace, wrong_name
-from consat.problem.family import Derived, Family
+from consat.problem.family import Family
 from consat.problem.groups import ACROSS, OTHER, PLACE, SELF, Each, Group, Ints, Layout, label, layout
+from consat.problem.index import Index
+from consat.problem.names import Derived
 from consat.problem.parameters import Path, checked, checked_rows
 from consat.problem.schedule import Schedule, Track
 
@@ -24,8 +26,7 @@ class Expansion:
     Attributes:
         group: a group without faults; see `faults_of`.
         first: index of its first member in the team.
-        ids: ids of the team.
-        find: function from an id to its index in the team, or None.
+        index: ids of the team.
         dimension: d.
         path: place of the group in the input, for faults.
         faults: list to which faults are added.
@@ -34,8 +35,7 @@ class Expansion:
 
     group: Group
     first: int
-    ids: Sequence[str]
-    find: Any
+    index: Index
     dimension: int
     path: Path
     faults: list[Fault]
@@ -81,11 +81,11 @@ class Expansion:
         """The family of one constraint of the group, with one row per owner and agent read, not numbered; None if it has faults."""
         constraint, known = each.constraint, len(self.faults)
         rows = self.members(each.of, path, where)
-        slots = self.slots(constraint, each.agent, path, where)
+        reads, relation = self.slots(constraint, each.agent, path, where)
         if len(self.faults) > known:
             return None
-        row, other = self.related(slots.relation, rows, path, where)
-        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in slots.reads]
+        row, other = self.related(relation, rows, path, where)
+        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in reads]
         values, tracks = {}, {}
         for key, parameter in constraint.parameters.items():
             value = self.values(parameter, row, other, (*path, key), key, where)
@@ -127,26 +127,19 @@ class Expansion:
         if isinstance(of, Mapping) and list(of) == ["every"] and type(of["every"]) is int and of["every"] >= 1:
             return np.flatnonzero((self.layout.steps % of["every"] == 0).all(axis=1))
         chosen = of if isinstance(of, list | tuple) else [of]
-        places = [self.find(name) for name in chosen if isinstance(name, str)]
+        places = [self.index.get(name) for name in chosen if isinstance(name, str)]
         inside = [place - self.first for place in places if place is not None and 0 <= place - self.first < count]
         if len(inside) != len(chosen) or not inside:
             example = f"first, last, {{every: 10}}, or ids of the group such as [{self.group.name}1]"
             self.faults.append(Fault((*path, "of"), f"of is {shown(of)}, but must be one of {example}", where))
         return np.unique(np.array(inside, dtype=np.int64))
 
-    class Slots(NamedTuple):
-        """The positions that ψ takes.
+    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> tuple[list[Any], Any]:
+        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`.
 
-        Attributes:
-            reads: `OWNER`, `OTHER`, or the index of an agent in the team, for each position.
-            relation: how `OTHER` is found; None if ψ does not read it.
+        Returns:
+            `OWNER`, `OTHER`, or the index of an agent in the team, for each position; and how `OTHER` is found, None if ψ does not read it.
         """
-
-        reads: list[Any]
-        relation: Any
-
-    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> Slots:
-        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`."""
         reads: list[Any] = []
         relation: Any = None
         written = constraint.source is not None
@@ -156,7 +149,7 @@ class Expansion:
             elif not isinstance(read, str) or (written and read == OTHER):
                 relation = agent if isinstance(read, str) else read
                 reads.append(OTHER)
-            elif (place := self.find(read)) is not None:
+            elif (place := self.index.get(read)) is not None:
                 reads.append(place)
             else:
                 relative = f"; in a group, {SELF} is the member and {OTHER} the one that `agent` tells of" if written else ""
@@ -173,7 +166,7 @@ class Expansion:
         fixed = [read for read in reads if isinstance(read, int)]
         if len(set(fixed)) < len(fixed):
             self.faults.append(Fault((*path, "agent"), "it names the same agent twice; name another agent", where))
-        return self.Slots(reads, relation)
+        return reads, relation
 
     def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
         """Resolve a relation for the owners `rows`.
@@ -186,7 +179,9 @@ class Expansion:
         if isinstance(relation, np.ndarray):
             inside = (relation >= 0) & (relation < self.group.count) if relation.dtype.kind in "iu" else np.zeros(1, dtype=bool)
             if relation.shape == rows.shape and inside.all():
-                return self.apart_from_itself(rows, relation.astype(np.int64), path, where)
+                if (rows == relation).any():
+                    self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
+                return rows, relation.astype(np.int64) + self.first
             message = f"agent must be an array of {len(rows)} places from 0 to {self.group.count - 1}, one for each of these constraints"
         elif isinstance(relation, Mapping):
             k = relation.get("nearest")
@@ -205,12 +200,6 @@ class Expansion:
             )
         self.faults.append(Fault((*path, "agent"), message, where))
         return rows[:0], rows[:0]
-
-    def apart_from_itself(self, rows: Ints, others: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
-        """Resolve an array of indices. Adds a fault if it names an owner itself."""
-        if (rows == others).any():
-            self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
-        return rows, others + self.first
 
     def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
         """Resolve an offset along the group (one step) or along the axes of its grid (d steps)."""
@@ -245,7 +234,11 @@ class Expansion:
             return -places[row]
         if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
             return places[row] - places[other - self.first] if key == "vector" else places[row]
-        if isinstance(value, np.ndarray) and value.ndim == (2 if isinstance(parameter, Vector) else 1) and not _fixed(parameter):
+        if (
+            isinstance(value, np.ndarray)
+            and value.ndim == (2 if isinstance(parameter, Vector) else 1)
+            and isinstance(parameter, Number | Vector)
+        ):
             rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
             return np.zeros(len(row)) if rows is None else rows
         one = checked(parameter, self.dimension, path, key, where, self.faults)
@@ -269,12 +262,10 @@ class Expansion:
             mine = [None] * len(parts) if rank is None else np.split(rank, ends)
             for p, again in zip(parts, mine, strict=True):
                 constraint = made[p][1]
-                names[p] = Derived(constraint.name or constraint.kind, self.ids if constraint.name is None else None, others[p], again)
+                names[p] = Derived(
+                    constraint.name or constraint.kind, self.index.ids if constraint.name is None else None, others[p], again
+                )
         return [(replace(family, number=family.number + p), names[p]) for p, (family, _) in enumerate(made)]
-
-
-def _fixed(parameter: Any) -> bool:
-    return not isinstance(parameter, Number | Vector)
 
 
 def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:

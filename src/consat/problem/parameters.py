@@ -176,6 +176,11 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
+def is_whole(value: Any, low: int, high: int) -> bool:
+    """Whether `value` is an integer from `low` to `high`. Booleans are not."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
+
+
 def is_printable(value: Any) -> bool:
     """Whether `value` is a text that can be shown: an id or a name."""
     return isinstance(value, str) and bool(value.strip()) and value.isprintable()

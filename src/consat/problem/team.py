@@ -15,11 +15,12 @@ from consat.problem.agent import Agent
 from consat.problem.constraints.record import OWNER, Constraint, Fixed
 from consat.problem.entries import alike, entries_of, trace
 from consat.problem.expansion import Expansion
-from consat.problem.family import Chosen, Family, assemble
+from consat.problem.family import Family, assemble
 from consat.problem.groups import Group
 from consat.problem.index import Index, who_is
 from consat.problem.links import Links, pairs_of, topology, unique
-from consat.problem.parameters import Path, vector
+from consat.problem.names import Chosen
+from consat.problem.parameters import Path, is_printable, is_whole, vector
 from consat.problem.schedule import FOREVER
 
 MOST_NAMED = 100_000
@@ -72,12 +73,12 @@ class Team:
     def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2, *, unit: str | None = None) -> None:
         self.members = tuple(agents)
         faults: list[Fault] = []
-        if isinstance(dimension, bool) or not isinstance(dimension, int | np.integer) or not 1 <= dimension <= 64:
+        if not is_whole(dimension, 1, 64):
             faults.append(Fault(("dimension",), f"dimension is {dimension!r}, but must be a whole number from 1 to 64", "dimension"))
             dimension = 0
         if not self.members:
             faults.append(Fault(("agents",), "a team needs at least one agent", "agents"))
-        if unit is not None and not (isinstance(unit, str) and unit.strip() and unit.isprintable() and len(unit) <= LONGEST_UNIT):
+        if unit is not None and not (is_printable(unit) and len(unit) <= LONGEST_UNIT):
             what = f"unit is {shown(unit)}, but must be a printable text of at most {LONGEST_UNIT} letters, such as m"
             faults.append(Fault(("unit",), what, "unit"))
         self.unit = unit
@@ -106,7 +107,7 @@ class Team:
         self.links = unique(pairs, self.count) if pairs is not None else topology(cast(str, links), self.count, self.families)
 
     def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[tuple[Family, Sequence[str]]]:
-        expansion = Expansion(group, first, index.ids, index.get, self.dimension, path, faults)
+        expansion = Expansion(group, first, index, self.dimension, path, faults)
         mine = slice(first, first + group.count)
         if group.start is not None:
             self.starts[mine] = group.start

@@ -118,13 +118,16 @@ def kind_of(model: Model[Any]) -> str:
 
 def model_data(model: Model[Any]) -> dict[str, Any]:
     """A model as plain data of a scenario file."""
-    return {"kind": kind_of(model)} | {each.name: _listed(getattr(model, each.name)) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
+    return _data(kind_of(model), model)
 
 
 def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
     """An obstacle as plain data of a scenario file."""
-    plain = {each.name: getattr(obstacle, each.name) for each in dataclasses.fields(obstacle)}
-    return {"kind": type(obstacle).__name__.lower()} | {key: _listed(value) for key, value in plain.items()}
+    return _data(type(obstacle).__name__.lower(), obstacle)
+
+
+def _data(kind: str, made: Any) -> dict[str, Any]:
+    return {"kind": kind} | {each.name: _listed(getattr(made, each.name)) for each in dataclasses.fields(made)}
 
 
 def _listed(value: Any) -> Any:

@@ -18,9 +18,9 @@ from jax import Array
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from consat.numerics import laid_out, on_device
+from consat.numerics import distinct, laid_out, on_device
 from consat.problem.constraints.curvature import read_curvatures
-from consat.problem.family import Family, distinct
+from consat.problem.family import Family
 from consat.problem.graphs import middles
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
