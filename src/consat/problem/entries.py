@@ -16,7 +16,7 @@ from consat.numerics import float64
 from consat.problem.constraints.record import OWNER, Constraint, Number, flatten
 from consat.problem.family import Family
 from consat.problem.index import SUGGESTIONS, Index, who_is
-from consat.problem.parameters import Path, checked, is_printable, still
+from consat.problem.parameters import Path, Spot, checked, is_printable, still
 from consat.problem.schedule import Schedule, Track
 
 
@@ -150,16 +150,17 @@ def entries_of(index: Index, dimension: int, faults: list[Fault]) -> Iterator[En
                 known = len(faults)
                 name = _name(constraint, taken, path, agent.id, who, faults)
                 where = f"{who}, constraint {name!r}"
-                reads = _reads(constraint, agent.id, index, path, where, faults)
+                spot = Spot(path, "", where, faults)
+                reads = _reads(constraint, agent.id, index, spot)
                 values: dict[str, np.ndarray] = {}
                 moving: dict[str, Schedule] = {}
                 for key, parameter in constraint.parameters.items():
-                    value = checked(parameter, dimension, (*path, key), key, where, faults)
+                    value = checked(parameter, dimension, spot.under(key))
                     if isinstance(value, Schedule):
                         moving[key], value = value, value.at(0.0)
                     if value is not None:
                         values[key] = value
-                weight = still(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
+                weight = still(Number(constraint.weight, positive=True), dimension, spot.under("weight"))
                 if len(faults) == known and reads and weight is not None:
                     yield Entry(constraint, i, reads, name, path, where, values, float(weight), moving)
 
@@ -190,21 +191,21 @@ def wrong_name(name: Any, taken: Container[str], whose: str) -> str | None:
     return f"name {name!r} is taken by another constraint of {whose}; choose another" if name in taken else None
 
 
-def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
-    key: Path = ("psi",) if constraint.source is not None else ("agent",)
+def _reads(constraint: Constraint, owner: str, index: Index, spot: Spot) -> tuple[int, ...]:
+    key = "psi" if constraint.source is not None else "agent"
     reads: list[str] = []
     for agent in constraint.reads:
         if isinstance(agent, str) and (agent == OWNER or agent in index):
             reads.append(owner if agent == OWNER else agent)
         else:
-            faults.append(Fault((*path, *key), index.unknown(agent, faults), where))
+            spot.fault(index.unknown(agent, spot.faults), key)
     if not isinstance(owner, str) or owner not in index:
         return ()  # the owner's id has a fault, which `Index` reports
     if owner not in reads:
-        faults.append(Fault((*path, *key), f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", where))
+        spot.fault(f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", key)
     if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
         itself = "its own owner" if repeated == owner else "the same agent twice"
-        faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
+        spot.fault(f"it names {itself}, {repeated!r}; name another agent", key)
     return tuple(index[agent] for agent in reads)
 
 

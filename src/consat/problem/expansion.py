@@ -15,7 +15,7 @@ from consat.problem.family import Family
 from consat.problem.groups import ACROSS, OTHER, PLACE, SELF, Each, Group, Ints, Layout, label, layout
 from consat.problem.index import Index
 from consat.problem.names import Derived
-from consat.problem.parameters import Path, checked, checked_rows
+from consat.problem.parameters import Path, Spot, checked, checked_rows
 from consat.problem.schedule import Schedule, Track
 
 
@@ -51,12 +51,13 @@ class Expansion:
         for path, each in self.entries():
             constraint = each.constraint
             where = f"{label(self.group)}, constraint {constraint.name or constraint.kind!r}"
+            spot = Spot(path, "", where, self.faults)
             if constraint.name is not None:
                 if message := wrong_name(constraint.name, taken, label(self.group)):
-                    self.faults.append(Fault((*path, "name"), message, where))
+                    spot.fault(message, "name")
                     continue
                 taken.add(constraint.name)
-            family = self.family(each, path, where)
+            family = self.family(each, spot)
             if family is not None and family.size:
                 first = {key: value[0] for key, value in family.parameters.items()}
                 made.append((family, Entry(constraint, self.first, tuple(range(family.arity)), "", path, where, first)))
@@ -77,27 +78,27 @@ class Expansion:
                     message = f"{constraint!r} is no constraint; use consat.within and its like"
                     self.faults.append(Fault(path, message, label(self.group)))
 
-    def family(self, each: Each, path: Path, where: str) -> Family | None:
+    def family(self, each: Each, spot: Spot) -> Family | None:
         """The family of one constraint of the group, with one row per owner and agent read, not numbered; None if it has faults."""
         constraint, known = each.constraint, len(self.faults)
-        rows = self.members(each.of, path, where)
-        reads, relation = self.slots(constraint, each.agent, path, where)
+        rows = self.members(each.of, spot)
+        reads, relation = self.slots(constraint, each.agent, spot)
         if len(self.faults) > known:
             return None
-        row, other = self.related(relation, rows, path, where)
+        row, other = self.related(relation, rows, spot)
         columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in reads]
         values, tracks = {}, {}
         for key, parameter in constraint.parameters.items():
-            value = self.values(parameter, row, other, (*path, key), key, where)
+            value = self.values(parameter, row, other, spot.under(key))
             if isinstance(value, Schedule):
                 many = len(row)
                 times, places = (np.broadcast_to(each, (many, *each.shape)) for each in (value.times, value.values))
                 tracks[key] = Track(np.arange(many, dtype=np.int32), times, places)
                 value = np.broadcast_to(value.at(0.0), (many, *value.values.shape[1:]))
             values[key] = value
-        weight = self.values(Number(constraint.weight, positive=True), row, other, (*path, "weight"), "weight", where)
+        weight = self.values(Number(constraint.weight, positive=True), row, other, spot.under("weight"))
         if isinstance(weight, Schedule):
-            self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
+            spot.fault("weight moves with time, but must be a positive number", "weight")
         if len(self.faults) > known or isinstance(weight, Schedule):
             return None
         return Family(
@@ -112,7 +113,7 @@ class Expansion:
             tracks=tracks if len(row) else {},
         )
 
-    def members(self, of: Any, path: Path, where: str) -> Ints:
+    def members(self, of: Any, spot: Spot) -> Ints:
         """The indices, in the group, of the members that own a constraint; see `each` for `of`."""
         count = self.group.count
         if of is None:
@@ -120,7 +121,7 @@ class Expansion:
         if isinstance(of, np.ndarray) and of.ndim == 1 and of.dtype.kind in "iu":
             if not len(of) or (of.min() >= 0 and of.max() < count):
                 return of.astype(np.int64)
-            self.faults.append(Fault((*path, "of"), f"of holds places beyond 0 to {count - 1}", where))
+            spot.fault(f"of holds places beyond 0 to {count - 1}", "of")
             return np.arange(0)
         if of in ("first", "last"):
             return np.array([0 if of == "first" else count - 1])
@@ -131,10 +132,10 @@ class Expansion:
         inside = [place - self.first for place in places if place is not None and 0 <= place - self.first < count]
         if len(inside) != len(chosen) or not inside:
             example = f"first, last, {{every: 10}}, or ids of the group such as [{self.group.name}1]"
-            self.faults.append(Fault((*path, "of"), f"of is {shown(of)}, but must be one of {example}", where))
+            spot.fault(f"of is {shown(of)}, but must be one of {example}", "of")
         return np.unique(np.array(inside, dtype=np.int64))
 
-    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> tuple[list[Any], Any]:
+    def slots(self, constraint: Constraint, agent: Any, spot: Spot) -> tuple[list[Any], Any]:
         """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`.
 
         Returns:
@@ -154,21 +155,21 @@ class Expansion:
             else:
                 relative = f"; in a group, {SELF} is the member and {OTHER} the one that `agent` tells of" if written else ""
                 key = "psi" if written else "agent"
-                self.faults.append(Fault((*path, key), f"there is no agent {shown(read)}{relative}", where))
+                spot.fault(f"there is no agent {shown(read)}{relative}", key)
         if OWNER not in reads and not self.faults:
             key = "psi" if written else "agent"
-            self.faults.append(Fault((*path, key), f"it must read the position of its owner, {SELF}, but does not", where))
+            spot.fault(f"it must read the position of its owner, {SELF}, but does not", key)
         if OTHER in reads and relation is None:
             message = f"agent is missing: it tells who `{OTHER}` is, such as -1 for the one ahead"
-            self.faults.append(Fault((*path, "agent"), message, where))
+            spot.fault(message, "agent")
         elif agent is not None and OTHER not in reads:
-            self.faults.append(Fault((*path, "agent"), f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", where))
+            spot.fault(f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", "agent")
         fixed = [read for read in reads if isinstance(read, int)]
         if len(set(fixed)) < len(fixed):
-            self.faults.append(Fault((*path, "agent"), "it names the same agent twice; name another agent", where))
+            spot.fault("it names the same agent twice; name another agent", "agent")
         return reads, relation
 
-    def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+    def related(self, relation: Any, rows: Ints, spot: Spot) -> tuple[Ints, Ints]:
         """Resolve a relation for the owners `rows`.
 
         Returns:
@@ -180,7 +181,7 @@ class Expansion:
             inside = (relation >= 0) & (relation < self.group.count) if relation.dtype.kind in "iu" else np.zeros(1, dtype=bool)
             if relation.shape == rows.shape and inside.all():
                 if (rows == relation).any():
-                    self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
+                    spot.fault("agent names the owner itself for some of these constraints", "agent")
                 return rows, relation.astype(np.int64) + self.first
             message = f"agent must be an array of {len(rows)} places from 0 to {self.group.count - 1}, one for each of these constraints"
         elif isinstance(relation, Mapping):
@@ -198,7 +199,7 @@ class Expansion:
                 f"agent is {shown(relation)}, but must be an id, a whole number other than 0, such as -1 for the one ahead{grid}, "
                 "or {nearest: k}"
             )
-        self.faults.append(Fault((*path, "agent"), message, where))
+        spot.fault(message, "agent")
         return rows[:0], rows[:0]
 
     def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
@@ -227,9 +228,9 @@ class Expansion:
         itself[~itself.any(axis=1), -1] = True  # where places coincide, the owner may be missing among those found
         return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
 
-    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
+    def values(self, parameter: Any, row: Ints, other: Ints, spot: Spot) -> np.ndarray | Schedule:
         """(M, …) values of one parameter, or one schedule for all. Placeholder values if a fault was added."""
-        value, places = parameter.value, self.layout.places
+        value, places, key = parameter.value, self.layout.places, spot.name
         if isinstance(parameter, Vector) and isinstance(value, str) and value == ACROSS and key == "center":
             return -places[row]
         if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
@@ -239,9 +240,9 @@ class Expansion:
             and value.ndim == (2 if isinstance(parameter, Vector) else 1)
             and isinstance(parameter, Number | Vector)
         ):
-            rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
+            rows = checked_rows(parameter, (len(row), self.dimension), spot)
             return np.zeros(len(row)) if rows is None else rows
-        one = checked(parameter, self.dimension, path, key, where, self.faults)
+        one = checked(parameter, self.dimension, spot)
         if isinstance(one, Schedule):
             return one
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from consat.problem.names import Chosen, Joined
-from consat.problem.schedule import Track, chosen
+from consat.problem.schedule import Track
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,22 +45,19 @@ class Family:
             which: (M,) boolean mask, or ascending indices.
         """
         rows = np.flatnonzero(which) if which.dtype == bool else which
+        tracks = {key: kept for key, track in self.tracks.items() if (kept := track.chosen(rows)) is not None}
         return replace(
             self, agents=self.agents[rows], owner=self.owner[rows], number=self.number[rows], weight=self.weight[rows],
             parameters={key: value[rows] for key, value in self.parameters.items()},
-            sources=None if self.sources is None else Chosen(self.sources, rows), tracks=chosen(self.tracks, rows),
+            sources=None if self.sources is None else Chosen(self.sources, rows), tracks=tracks,
         )  # fmt: skip
 
     def at(self, time: float) -> Family:
         """The family with its parameters frozen at `time`, s."""
-        return replace(self, parameters=self.parameters_at(time), tracks={}) if self.tracks else self
-
-    def parameters_at(self, time: float) -> Mapping[str, np.ndarray]:
-        """The parameters at `time`, s; arrays as in `parameters`."""
-        return {
-            **self.parameters,
-            **{key: _written(self.parameters[key], track.rows, track.at(time)) for key, track in self.tracks.items()},
-        }
+        if not self.tracks:
+            return self
+        moving = {key: _written(self.parameters[key], track.rows, track.at(time)) for key, track in self.tracks.items()}
+        return replace(self, parameters={**self.parameters, **moving}, tracks={})
 
     @property
     def lasting(self) -> Mapping[str, np.ndarray]:

@@ -20,7 +20,7 @@ from consat.problem.groups import Group
 from consat.problem.index import Index, who_is
 from consat.problem.links import Links, pairs_of, topology, unique
 from consat.problem.names import Chosen
-from consat.problem.parameters import Path, is_printable, is_whole, vector
+from consat.problem.parameters import Path, Spot, is_printable, is_whole, vector
 from consat.problem.schedule import FOREVER
 
 MOST_NAMED = 100_000
@@ -93,7 +93,7 @@ class Team:
             trace(entries, self.dimension, faults)
             for k, i, agent in index.singles:
                 if agent.start is not None:
-                    start = vector(agent.start, self.dimension, ("agents", k, "start"), "start", who_is(k, agent.id), faults)
+                    start = vector(agent.start, self.dimension, Spot(("agents", k, "start"), "start", who_is(k, agent.id), faults))
                     self.starts[i] = np.nan if start is None else start
             for k, i, group in index.groups:
                 parts += self._expand(group, i, index, ("agents", k), faults)

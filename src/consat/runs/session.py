@@ -32,7 +32,7 @@ from consat.problem.agent import Agent
 from consat.problem.changes import Change, changed, changes_of, is_adjustment, is_structural, place_of
 from consat.problem.constraints.library import ADJUSTABLE, farthest
 from consat.problem.graphs import require_connected
-from consat.problem.parameters import vector
+from consat.problem.parameters import Spot, vector
 from consat.problem.team import Team
 from consat.problem.units import scale
 from consat.protocols import FLOWS, PAIRED, ROUNDS, with_gains
@@ -276,7 +276,7 @@ class Session:
         """
         i = self._place_of(agent)
         faults: list[Fault] = []
-        value = vector(position, self.dimension, ("position",), "position", f"agent {agent!r}", faults)
+        value = vector(position, self.dimension, Spot(("position",), "position", f"agent {agent!r}", faults))
         if value is None:
             raise InvalidTeam(faults)
         self._state = placed(self._state, self._engine.carrier.world, i, value, own=self._body.reach is None)

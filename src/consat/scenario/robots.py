@@ -150,9 +150,9 @@ def model_of(data: Any, where: str = "robots", base: Mapping[str, Any] | None = 
     return _made(data, KINDS, where, "{kind: unicycle, radius: 0.1}", base)
 
 
-def obstacle_of(data: Any, where: str = "obstacle") -> Obstacle:
+def obstacle_of(data: Any) -> Obstacle:
     """An obstacle from a mapping of a scenario file; raises as `model_of`."""
-    made: Obstacle = _made(data, SHAPES, where, "{kind: disc, center: [0, 0], radius: 1}", None)
+    made: Obstacle = _made(data, SHAPES, "obstacle", "{kind: disc, center: [0, 0], radius: 1}", None)
     return made
 
 

@@ -15,6 +15,7 @@ from consat.errors import AT_KEY, Fault, InvalidInput, InvalidTeam, counted, sho
 from consat.problem.agent import Agent
 from consat.problem.constraints import KINDS
 from consat.problem.groups import MOST, Each, Group
+from consat.problem.index import who_is
 from consat.problem.links import Links
 from consat.problem.parameters import LARGEST, is_number, is_printable
 from consat.problem.team import Team
@@ -272,7 +273,7 @@ def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
     if "id" not in data:
         faults.add((*path, "id"), "id is missing; every agent needs one, such as a1", where)
     name = data.get("id", "")
-    where = f"agent {name!r}" if isinstance(name, str) and name.strip() else where
+    where = who_is(int(path[-1]), name)
     made = [_constraint(item, at, where, faults) for at, item in _constraints(data, path, where, faults)]
     return Agent(name, made, data.get("start"))
 

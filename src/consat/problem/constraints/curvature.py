@@ -218,7 +218,7 @@ class _Family:
 
 
 @np.errstate(all="ignore")
-def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array, Array]:
+def _classify(node: Node, arity: int, members: int, *, moving: bool) -> tuple[Array, Array, Array]:
     """The curvature of ψ from its node.
 
     Args:
