@@ -29,6 +29,8 @@ from consat.problem.units import scale
 
 STARTS = 32
 """Number of starts for a team that is not concave."""
+CONCAVE_STARTS = 4
+"""And for a concave team that is not quadratic."""
 POLISHED = 3
 """Number of the best starts of each cluster that are polished."""
 MOST_VALUES = 4_000_000
@@ -64,12 +66,11 @@ class Optimum:
     unbounded: bool = False
 
 
-def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
+def max_min(team: Team, *, seed: int = 0) -> Optimum:
     """Maximise the margin of a team.
 
     Args:
         team: the team.
-        starts: number of starts for a team that is not concave quadratic. If None, 4 for a concave team, else `STARTS`.
         seed: seed of the random starts.
     """
     shape, cluster = shape_of(team), clusters(team)
@@ -78,7 +79,7 @@ def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
         return Optimum(first, np.inf, np.zeros(0), "no constraints", exact=True)
     if shape.quadratic.all() and shape.concave.all():
         return _quadratic(team, cluster, first)
-    return _smooth(team, cluster, first, starts, seed, concave=bool(shape.concave.all()))
+    return _smooth(team, cluster, first, seed, concave=bool(shape.concave.all()))
 
 
 def cluster_margins(team: Team, values: Floats, cluster: Ints) -> Floats:
@@ -123,7 +124,7 @@ def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
     if solution.status == "unbounded":
         return _limitless(team, cluster, model)
     if solution.status == "failed":
-        return _smooth(team, cluster, x, None, 0, concave=True)
+        return _smooth(team, cluster, x, 0, concave=True)
     margin = float(values_and_gradients(team, x)[0].min())
     return Optimum(x, margin, solution.multipliers, "concave quadratic constraints: exact, by one cone program (Clarabel)", exact=True)
 
@@ -160,11 +161,10 @@ def _replaced(solution: Solution, by: Solution, agents: Bools, constraints: Bool
     return Solution(step, np.where(constraints, by.multipliers, solution.multipliers), solution.status)
 
 
-def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: int, *, concave: bool) -> Optimum:
+def _smooth(team: Team, cluster: Ints, first: Floats, seed: int, *, concave: bool) -> Optimum:
     """The optimum of a team that is not concave quadratic: ascent from many starts, then polishing; arguments as in `max_min`."""
     size = scale(team)
-    wanted = starts or (4 if concave else STARTS)
-    count = max(1, min(wanted, MOST_VALUES // max(len(team.owner), 1)))
+    count = max(1, min(CONCAVE_STARTS if concave else STARTS, MOST_VALUES // max(len(team.owner), 1)))
     formations, margins = climb(team, np.concatenate([first[None], drawn(team, count - 1, seed, size)]), cluster, size)
     order = np.argsort(-margins, axis=0, kind="stable")
     x, multipliers = first, np.zeros(len(team.owner))

@@ -20,7 +20,7 @@ from consat.problem.parameters import Path, Spot, checked, is_printable, still
 from consat.problem.schedule import Schedule, Track
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Entry:
     """One checked constraint that is not yet in a family.
 
@@ -70,9 +70,10 @@ def trace(entries: Iterable[Entry], dimension: int, faults: list[Fault]) -> None
     """Trace ψ once per family, so that errors in a user's function are found before anything runs. Adds to `faults`."""
     seen: dict[tuple[Any, ...], Fault | None] = {}
     for entry in entries:
-        first = entry.family not in seen
-        fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
-        if fault is not None and not first:
+        family = entry.family
+        if family not in seen:
+            fault = seen[family] = _untraceable(entry, dimension)
+        elif (fault := seen[family]) is not None:
             written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
             # Expressions of one family may be written differently, so the column of the error differs.
             again = _untraceable(entry, dimension) if written else None
@@ -202,12 +203,8 @@ def _reads(constraint: Constraint, owner: str, index: Index, spot: Spot) -> tupl
     if not isinstance(owner, str) or owner not in index:
         return ()  # the owner's id has a fault, which `Index` reports
     if owner not in reads:
-        spot.fault(f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", key)
+        spot.fault(f"it must read the position of its owner {owner!r}, but reads {', '.join(map(repr, reads)) or 'nothing'}", key)
     if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
         itself = "its own owner" if repeated == owner else "the same agent twice"
         spot.fault(f"it names {itself}, {repeated!r}; name another agent", key)
     return tuple(index[agent] for agent in reads)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names)) or "nothing"
