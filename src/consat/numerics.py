@@ -92,6 +92,19 @@ def stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
+def distinct(keys: np.ndarray) -> np.ndarray:
+    """The distinct integers, sorted. For millions of keys several times as fast as `numpy.unique`.
+
+    Args:
+        keys: (K,) integers.
+    """
+    rising = np.all(keys[1:] >= keys[:-1])
+    ordered = keys if rising else np.sort(keys)
+    new = np.ones(len(ordered), dtype=bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
+    return ordered if new.all() else ordered[new]
+
+
 def quick_compilation() -> dict[str, bool | int] | None:
     """Compiler options for programs that compile longer than they run; None if the backend is not the CPU.
 

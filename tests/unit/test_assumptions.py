@@ -154,5 +154,5 @@ def test_the_auxiliary_constraint_restores_what_was_missing() -> None:
 
 
 def test_an_auxiliary_constraint_that_binds_is_noticed() -> None:
-    team = with_auxiliary(case("d"), 0.2, [0, 0])
+    team = with_auxiliary(case("d"), 0.2)
     assert binding_auxiliaries(team, max_min(team).multipliers) == ["a1", "a3"]

@@ -14,13 +14,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from consat.certify.quadratics import Floats, Ints, expand, shape_of
 from consat.certify.recession import Recession, recession
 from consat.problem.constraints.library import within
 from consat.problem.family import Family
-from consat.problem.graphs import clusters, disconnected, relays
+from consat.problem.graphs import clusters, disconnected, members, relays
 from consat.problem.team import Team
 from consat.problem.units import scale
 
@@ -45,7 +44,7 @@ def report(team: Team) -> dict[str, Any]:
         "schema": SCHEMA,
         "agents": list(team.ids) if listed else None,
         "count": team.count,
-        "clusters": _members(team, cluster, count) if listed else None,
+        "clusters": members(team, cluster) if listed else None,
         "cluster_count": count,
         "communication_connected": not parts,
         "relays": joining if listed else None,
@@ -85,25 +84,23 @@ def existence(team: Team) -> tuple[bool | None, bool | None, list[str]]:
     return bounded, unique, [team.ids[i] for i in np.flatnonzero(adrift).tolist()] if bounded is False else []
 
 
-def with_auxiliary(team: Team, radius: float, center: ArrayLike | None = None) -> Team:
+def with_auxiliary(team: Team, radius: float) -> Team:
     """The team with an auxiliary constraint ψ = radius² − ‖x_i − o‖² for each agent, so that level sets are compact and the optimum unique.
+
+    The centre o is the natural centre of the team; see `consat.problem.units`.
 
     Args:
         team: the team.
         radius: √c_aux > 0, length. It should be too large to bind; see `binding_auxiliaries`.
-        center: o, (d,), length. If None, the natural centre of the team; see `consat.problem.units`.
     """
-    ball = within(np.zeros(team.dimension) if center is None else center, radius)
-    o = scale(team).center if center is None else np.asarray(center, dtype=float)
+    center = scale(team).center
+    ball = within(center, radius)
     agents = np.arange(team.count, dtype=np.int32)
     ends = np.cumsum(team.constraints_per_agent)
-    moved = [
-        replace(family, number=(family.number + family.owner).astype(np.int32))
-        for family in team.families
-    ]  # fmt: skip
+    moved = [replace(family, number=(family.number + family.owner).astype(np.int32)) for family in team.families]
     added = Family(
         kind=ball.kind, psi=ball.psi, agents=agents[:, None], owner=agents, number=(ends + agents).astype(np.int32),
-        parameters={"center": np.tile(o, (team.count, 1)), "radius": np.full(team.count, float(radius))}, weight=np.ones(team.count),
+        parameters={"center": np.tile(center, (team.count, 1)), "radius": np.full(team.count, float(radius))}, weight=np.ones(team.count),
     )  # fmt: skip
     owner = np.insert(team.owner, ends, agents).astype(np.int32)
     names = np.insert(np.array(team.names, dtype=object), ends, AUXILIARY).tolist()
@@ -119,13 +116,6 @@ def binding_auxiliaries(team: Team, multipliers: Floats, threshold: float = 1e-6
         threshold: multipliers up to this count as 0; solvers leave small residues.
     """
     return [team.ids[int(team.owner[k])] for k in np.flatnonzero(multipliers > threshold).tolist() if team.names[k] == AUXILIARY]
-
-
-def _members(team: Team, cluster: Ints, count: int) -> list[list[str]]:
-    members: list[list[str]] = [[] for _ in range(count)]
-    for agent, label in zip(team.ids, cluster, strict=True):
-        members[label].append(agent)
-    return members
 
 
 def _constraints(team: Team) -> list[dict[str, Any]]:

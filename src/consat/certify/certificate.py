@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from consat.certify.conic import normalised, units
 from consat.certify.levels import radii, with_tangents
-from consat.certify.optimum import Optimum, max_min, middle
+from consat.certify.optimum import Optimum, cluster_margins, max_min, middle
 from consat.certify.quadratics import Expansion, Floats, Ints, expand, shape_of
 from consat.numerics import float64, on_device
 from consat.problem.graphs import clusters
@@ -62,17 +62,24 @@ class Certificate:
         lower: lower bound: β̄ at the given formation. +∞ for a team without constraints.
         upper: proven upper bound; None if there is none.
         multipliers: (M,) λ that prove `upper`. They sum to 1 within each cluster for which a bound is proven.
-        verdict: ``feasible`` if the given formation satisfies all constraints, ``infeasible`` if `upper` ≤ 0, else ``undecided``.
-        binding: indices of the constraints with λ above `BINDING`, the largest first.
         clusters: (C, 2) lower and upper bound of each cluster; +∞ where there are no constraints or nothing is proven.
     """
 
     lower: float
     upper: float | None
     multipliers: Floats
-    verdict: Verdict
-    binding: Ints
     clusters: Floats
+
+    @property
+    def verdict(self) -> Verdict:
+        """``feasible`` if the given formation satisfies all constraints, ``infeasible`` if `upper` ≤ 0, else ``undecided``."""
+        return "feasible" if self.lower > 0 else "infeasible" if self.upper is not None and self.upper <= 0 else "undecided"
+
+    @property
+    def binding(self) -> Ints:
+        """Indices of the constraints with λ above `BINDING`, the largest first."""
+        heavy = np.flatnonzero(self.multipliers > BINDING)
+        return heavy[np.argsort(-self.multipliers[heavy], kind="stable")]
 
 
 @float64
@@ -88,7 +95,7 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
     """
     x = np.asarray(positions, dtype=float)
     if not len(team.owner):
-        return Certificate(np.inf, None, np.zeros(0), "feasible", np.zeros(0, dtype=np.intp), np.full((team.count, 2), np.inf))
+        return Certificate(np.inf, None, np.zeros(0), np.full((team.count, 2), np.inf))
     if x.size > LARGE and np.isfinite(x).all():
         return _about_the_worst(team, x, nu, refine)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -97,17 +104,13 @@ def bounds(team: Team, positions: Floats, nu: Nu | None = None, refine: bool = T
         if model is not None and lower == -np.inf:  # upper bounds hold for any expansion point
             model = expand(team, middle(team))
         if model is None or not np.isfinite(model.value).all():
-            return Certificate(-np.inf, None, np.zeros(len(team.owner)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+            return Certificate(-np.inf, None, np.zeros(len(team.owner)), np.zeros((0, 2)))
         proof = _Proof(team, model)
         proof.ladder(nu, multipliers)
         if refine:
             proof.climb()
     upper = float(proof.upper.min())
-    verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper <= 0 else "undecided"
-    heavy = np.flatnonzero(proof.best > BINDING)
-    order = heavy[np.argsort(-proof.best[heavy], kind="stable")]
-    each = np.stack([proof.margins, proof.upper], axis=1)
-    return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, verdict, order, each)
+    return Certificate(lower, upper if np.isfinite(upper) else None, proof.best, np.stack([proof.margins, proof.upper], axis=1))
 
 
 def judged(team: Team) -> tuple[Optimum, Certificate]:
@@ -120,7 +123,7 @@ def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Cert
     """Certify a large team through a part around its worst constraint: an upper bound for some of the constraints holds for all."""
     values = np.asarray(evaluate(Objective.at_positions(team), on_device(x)))
     if not np.isfinite(values).all():
-        return Certificate(-np.inf, None, np.zeros(len(values)), "undecided", np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+        return Certificate(-np.inf, None, np.zeros(len(values)), np.zeros((0, 2)))
     mine = np.zeros(team.count, dtype=bool)
     mine[team.owner[int(np.argmin(values))]] = True
     for _ in range(STEPS):
@@ -131,17 +134,15 @@ def _about_the_worst(team: Team, x: Floats, nu: Nu | None, refine: bool) -> Cert
     agents = np.flatnonzero(mine)
     part, numbers = team.part(agents)
     found = bounds(part, x[agents], nu, refine)
-    lower, upper = float(values.min()), found.upper
-    upper = None if upper is None else max(upper, lower)
+    lower = float(values.min())
     multipliers = np.zeros(len(values))
     multipliers[numbers] = found.multipliers
     cluster = clusters(team)
-    each = np.full((int(cluster.max()) + 1, 2), np.inf)
-    np.minimum.at(each[:, 0], cluster[team.owner], values)
-    own = clusters(part)
-    each[cluster[agents[np.unique(own, return_index=True)[1]]], 1] = found.clusters[:, 1]
-    verdict: Verdict = "feasible" if lower > 0 else "infeasible" if upper is not None and upper <= 0 else "undecided"
-    return Certificate(lower, upper, multipliers, verdict, numbers[found.binding], each)
+    margins = cluster_margins(team, values, cluster)
+    uppers = np.full(len(margins), np.inf)
+    uppers[cluster[agents[np.unique(clusters(part), return_index=True)[1]]]] = found.clusters[:, 1]
+    upper = None if found.upper is None else max(found.upper, lower)
+    return Certificate(lower, upper, multipliers, np.stack([margins, uppers], axis=1))
 
 
 class _Proof:
@@ -168,12 +169,10 @@ class _Proof:
         self.team, self.group, self.count = team, self.cluster[team.owner], int(self.cluster.max()) + 1
         self.concave, self.exact = shape.concave, bool((shape.quadratic | ~shape.concave).all())
         self.model = model.keep(self.concave)
-        margins = np.full(self.count, np.inf)
-        np.minimum.at(margins, self.group, model.value)
-        self.margins = margins
+        self.margins = cluster_margins(team, model.value, self.cluster)
         unit = units(self.model, self.group, self.count)
         self.psi = unit.psi[self.group]
-        known, lower = self.model, margins[self.group]
+        known, lower = self.model, self.margins[self.group]
         if not self.exact:
             known, lower = with_tangents(team, known, lower, self.concave & ~shape.quadratic, float(unit.length.max()))
         self.radius = radii(known, lower, self.cluster)
@@ -250,8 +249,7 @@ class _Proof:
 
     def smooth(self, values: Floats, nu: Floats) -> Floats:
         """(C,) β of each cluster's concave constraints."""
-        low = np.full(self.count, np.inf)
-        np.minimum.at(low, self.group, np.where(self.concave, values, np.inf))
+        low = cluster_margins(self.team, np.where(self.concave, values, np.inf), self.cluster)
         base = np.where(np.isfinite(low), low, 0.0)
         total = np.bincount(self.group, np.where(self.concave, np.exp(-nu * (values - base[self.group])), 0.0), minlength=self.count)
         sharp = np.ones(self.count)
@@ -313,15 +311,11 @@ def _solve(bend: sparse.csc_array, slope: Floats, damping: float) -> Floats:
     if len(slope) <= DENSE:
         dense = bend.toarray()
         dense[np.diag_indices(len(slope))] += damping * largest
-        return _dense(dense, slope)
-    factor = splu((bend + sparse.diags_array(np.full(len(slope), damping * largest))).tocsc(), permc_spec="MMD_AT_PLUS_A")
-    step: Floats = factor.solve(slope)
-    return np.where(np.isfinite(step), step, 0.0)
-
-
-def _dense(matrix: Floats, slope: Floats) -> Floats:
-    try:
-        step = np.asarray(np.linalg.solve(matrix, slope), dtype=float)
-    except np.linalg.LinAlgError:
-        return np.zeros_like(slope)
+        try:
+            step = np.linalg.solve(dense, slope)
+        except np.linalg.LinAlgError:
+            return np.zeros_like(slope)
+    else:
+        damped = bend + sparse.diags_array(np.full(len(slope), damping * largest))
+        step = splu(damped.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(slope)
     return np.where(np.isfinite(step), step, 0.0)

@@ -8,7 +8,6 @@ maximises all of them. Each cluster is scaled to its own units first, so that th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -193,7 +192,10 @@ def _solve(slope: Floats, cones: list[Cones]) -> tuple[Floats, list[Floats]] | s
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
-    shapes = list(_shapes(cones))
+    shapes: list[Any] = []
+    for each in cones:
+        line = each.size == 1
+        shapes += [clarabel.NonnegativeConeT(each.members)] if line else [clarabel.SecondOrderConeT(each.size) for _ in range(each.members)]
     matrix = sparse.csc_matrix(sparse.vstack([each.matrix for each in cones], format="csc"))
     nothing = sparse.csc_matrix((len(slope), len(slope)))
     found = clarabel.DefaultSolver(nothing, slope, matrix, np.concatenate([each.offset for each in cones]), shapes, settings).solve()
@@ -205,16 +207,6 @@ def _solve(slope: Floats, cones: list[Cones]) -> tuple[Floats, list[Floats]] | s
     ends = np.cumsum([each.members * each.size for each in cones])[:-1]
     duals = np.split(np.asarray(found.z), ends)
     return np.asarray(found.x), [dual.reshape(each.members, each.size) for dual, each in zip(duals, cones, strict=True)]
-
-
-def _shapes(cones: list[Cones]) -> Iterator[Any]:
-    import clarabel
-
-    for each in cones:
-        if each.size == 1:
-            yield clarabel.NonnegativeConeT(each.members)
-        else:
-            yield from (clarabel.SecondOrderConeT(each.size) for _ in range(each.members))
 
 
 def normalised(weights: Floats, group: Ints, count: int) -> Floats:

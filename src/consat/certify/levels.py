@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
-from consat.certify.quadratics import Block, Expansion, Floats, Ints, tangents
+from consat.certify.quadratics import Block, Expansion, Floats, Ints, columns_of, tangents
+from consat.problem.graphs import components
 from consat.problem.team import Team
 
 MOST_POLYTOPES = 2000
@@ -129,7 +130,7 @@ def with_tangents(team: Team, model: Expansion, lower: Floats, curved: NDArray[n
         members = curved[family.number]
         if not members.any() or family.arity > 2:
             continue
-        columns = (family.agents[members].astype(np.intp)[:, :, None] * dimension + np.arange(dimension)).reshape(members.sum(), -1)
+        columns = columns_of(team)[f][members]
         for shift in shifts:
             arguments = model.at[family.agents]
             arguments[:, 0] += shift
@@ -222,7 +223,7 @@ def _together(walls: _Planes, pair: Ints, reach: Floats, paths: Floats) -> Float
     count = len(paths)
     tied = pair[:, 0] != pair[:, 1]
     graph = _graph(pair[tied], reach[tied], count)
-    part = connected_components(graph, directed=False)[1]
+    part = components(pair[tied], count)
     own = walls.pair[:, 0] == walls.pair[:, 1]
     where, normal, height = walls.pair[own, 0], walls.normal[own], walls.height[own]
     sizes = np.linalg.norm(normal, axis=1)
@@ -280,11 +281,7 @@ def _ellipsoid(model: Expansion, lower: Floats, cluster: Ints) -> Floats:
     At a better formation each ψ_k is at least L, so the sum is at least L times the sum of the weights. If the sum is strictly concave,
     such formations lie in an ellipsoid.
     """
-    weights, gap = np.zeros(len(model.value)), np.zeros(len(model.value))
-    for block in model.blocks:
-        norm = np.linalg.norm(block.hessian, axis=(1, 2))
-        weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
-        gap[block.number] = np.maximum(model.value[block.number] - lower[block.number], 0.0)
+    weights, gap = model.inverse_bend(), np.maximum(model.value - lower, 0.0)
     reach = np.full(model.at.shape[0], np.inf)
     bend, slope = -model.hessian(weights).toarray(), model.gradient(weights).ravel()
     home = np.full(len(weights), -1)

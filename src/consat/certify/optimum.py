@@ -29,6 +29,8 @@ from consat.problem.units import scale
 
 STARTS = 32
 """Number of starts for a team that is not concave."""
+CONCAVE_STARTS = 4
+"""And for a concave team that is not quadratic."""
 POLISHED = 3
 """Number of the best starts of each cluster that are polished."""
 MOST_VALUES = 4_000_000
@@ -64,12 +66,11 @@ class Optimum:
     unbounded: bool = False
 
 
-def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
+def max_min(team: Team, *, seed: int = 0) -> Optimum:
     """Maximise the margin of a team.
 
     Args:
         team: the team.
-        starts: number of starts for a team that is not concave quadratic. If None, 4 for a concave team, else `STARTS`.
         seed: seed of the random starts.
     """
     shape, cluster = shape_of(team), clusters(team)
@@ -78,7 +79,7 @@ def max_min(team: Team, *, starts: int | None = None, seed: int = 0) -> Optimum:
         return Optimum(first, np.inf, np.zeros(0), "no constraints", exact=True)
     if shape.quadratic.all() and shape.concave.all():
         return _quadratic(team, cluster, first)
-    return _smooth(team, cluster, first, starts, seed, concave=bool(shape.concave.all()))
+    return _smooth(team, cluster, first, seed, concave=bool(shape.concave.all()))
 
 
 def cluster_margins(team: Team, values: Floats, cluster: Ints) -> Floats:
@@ -98,21 +99,13 @@ def middle(team: Team) -> Floats:
     usable = shape.quadratic & shape.concave
     for _ in range(2):  # the second pass recovers digits lost if the first began far away
         model = expand(team, x).keep(usable)
-        weights = _inverse_bend(model)
+        weights = model.inverse_bend()
         bend = -model.hessian(weights)
         damping = 1e-9 * np.maximum(bend.diagonal(), 1.0)
         curved = bend.diagonal() > 0
         step = splu((bend + eye_array(model.size) * damping.max()).tocsc()).solve(np.where(curved, model.gradient(weights).ravel(), 0.0))
         x = x + np.where(curved, step, 0.0).reshape(x.shape)
     return x
-
-
-def _inverse_bend(model: Expansion) -> Floats:
-    weights = np.zeros(len(model.value))
-    for block in model.blocks:
-        norm = np.linalg.norm(block.hessian, axis=(1, 2))
-        weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
-    return weights
 
 
 def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
@@ -131,7 +124,7 @@ def _quadratic(team: Team, cluster: Ints, x: Floats) -> Optimum:
     if solution.status == "unbounded":
         return _limitless(team, cluster, model)
     if solution.status == "failed":
-        return _smooth(team, cluster, x, None, 0, concave=True)
+        return _smooth(team, cluster, x, 0, concave=True)
     margin = float(values_and_gradients(team, x)[0].min())
     return Optimum(x, margin, solution.multipliers, "concave quadratic constraints: exact, by one cone program (Clarabel)", exact=True)
 
@@ -168,35 +161,26 @@ def _replaced(solution: Solution, by: Solution, agents: Bools, constraints: Bool
     return Solution(step, np.where(constraints, by.multipliers, solution.multipliers), solution.status)
 
 
-def _smooth(team: Team, cluster: Ints, first: Floats, starts: int | None, seed: int, *, concave: bool) -> Optimum:
+def _smooth(team: Team, cluster: Ints, first: Floats, seed: int, *, concave: bool) -> Optimum:
     """The optimum of a team that is not concave quadratic: ascent from many starts, then polishing; arguments as in `max_min`."""
     size = scale(team)
-    wanted = starts or (4 if concave else STARTS)
-    count = max(1, min(wanted, MOST_VALUES // max(len(team.owner), 1)))
+    count = max(1, min(CONCAVE_STARTS if concave else STARTS, MOST_VALUES // max(len(team.owner), 1)))
     formations, margins = climb(team, np.concatenate([first[None], drawn(team, count - 1, seed, size)]), cluster, size)
     order = np.argsort(-margins, axis=0, kind="stable")
-    best: tuple[Floats, Floats, Floats, Bools] | None = None
+    x, multipliers = first, np.zeros(len(team.owner))
+    best, converged = np.full(margins.shape[1], -np.inf), np.zeros(margins.shape[1], dtype=bool)
     for rank in range(min(1 if concave else POLISHED, count)):
-        x = formations[order[rank][cluster], np.arange(team.count)]
-        polished, multipliers, settled = _polish(team, cluster, x)
+        polished, weights, settled = _polish(team, cluster, formations[order[rank][cluster], np.arange(team.count)])
         reached = cluster_margins(team, values_and_gradients(team, polished)[0], cluster)
-        if best is None:
-            best = polished, multipliers, reached, settled
-            continue
-        gained = reached > best[2]
-        best = (
-            np.where(gained[cluster][:, None], polished, best[0]),
-            np.where(gained[cluster[team.owner]], multipliers, best[1]),
-            np.maximum(reached, best[2]),
-            np.where(gained, settled, best[3]),
-        )
-    assert best is not None
+        gained = (reached > best) | (rank == 0)
+        x, multipliers = np.where(gained[cluster][:, None], polished, x), np.where(gained[cluster[team.owner]], weights, multipliers)
+        best, converged = np.where(gained, reached, best), np.where(gained, settled, converged)
     found = f"best of {count} starts, ν-continuation and sequential cone programs (Clarabel)"
     if not concave:
-        return Optimum(best[0], float(best[2].min()), best[1], found, exact=False)
-    exact = bool(best[3].all() and (best[2] > -np.inf).all())
+        return Optimum(x, float(best.min()), multipliers, found, exact=False)
+    exact = bool(converged.all() and (best > -np.inf).all())
     note = "concave constraints: exact" if exact else "concave constraints, not converged"
-    return Optimum(best[0], float(best[2].min()), best[1], f"{note}, {found}", exact=exact)
+    return Optimum(x, float(best.min()), multipliers, f"{note}, {found}", exact=exact)
 
 
 def _polish(team: Team, cluster: Ints, x: Floats) -> tuple[Floats, Floats, Bools]:

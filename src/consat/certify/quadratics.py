@@ -78,10 +78,7 @@ def shape_of(team: Team) -> Shape:
 
 def _hessians(family: Family, dimension: int) -> Floats:
     constant = hessians(family.psi, family.arity, dimension, family.lasting, family.size)
-    alike = np.all(family.weight == family.weight[0])
-    if alike and family.weight[0] == 1.0:
-        return constant
-    return constant * family.weight[:, None, None]
+    return constant if (family.weight == 1.0).all() else constant * family.weight[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -138,6 +135,14 @@ class Expansion:
         for block in self.blocks:
             found[block.number] = True
         return found
+
+    def inverse_bend(self) -> Floats:
+        """(M,) 1/‖H_k‖, weights with which all curved constraints count alike; 0 for those that are affine or have no expansion."""
+        weights = np.zeros(len(self.value))
+        for block in self.blocks:
+            norm = np.linalg.norm(block.hessian, axis=(1, 2))
+            weights[block.number] = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
+        return weights
 
     def values(self, y: Floats) -> Floats:
         """(M,) values of the expansion at x₀ + y, y of shape (N, d). Constraints without a block have the value c."""
@@ -224,7 +229,8 @@ def _on_device(team: Team) -> list[_Device]:
 
 
 @functools.lru_cache(maxsize=16)
-def _columns(team: Team) -> tuple[Ints, ...]:
+def columns_of(team: Team) -> tuple[Ints, ...]:
+    """For each family the (M_f, n) coordinates that its constraints read, as in `Block`. Cached by team."""
     axes = np.arange(team.dimension)
     return tuple(
         (family.agents.astype(np.intp)[:, :, None] * team.dimension + axes).reshape(family.size, family.arity * team.dimension)
@@ -270,7 +276,7 @@ def expand(team: Team, at: Floats) -> Expansion:
     value, gradients = values_and_gradients(team, at)
     blocks = []
     for family, device, columns, gradient, constant in zip(
-        team.families, _on_device(team), _columns(team), gradients, shape_of(team).hessians, strict=True
+        team.families, _on_device(team), columns_of(team), gradients, shape_of(team).hessians, strict=True
     ):
         hessian = np.asarray(_second_order(*device, on_device(at))) if constant is None else constant
         whole = Block(family.number, columns, gradient.reshape(columns.shape), hessian)

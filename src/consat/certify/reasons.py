@@ -204,16 +204,10 @@ STANDARD = ("within", "outside", "near", "apart", "displacement", "halfspace", "
 """Library kinds, whose parameters can be named in a proposal."""
 
 
-def _slopes(family: Family, arguments: Floats, parameters: dict[str, Any]) -> dict[str, Floats]:
-    """∂ψ/∂p of one member, for each of its floating-point parameters."""
-    inexact = {key: jnp.asarray(value) for key, value in parameters.items() if np.issubdtype(np.asarray(value).dtype, np.floating)}
-    fixed = {key: value for key, value in parameters.items() if key not in inexact}
-
-    def psi(varied: dict[str, jax.Array]) -> jax.Array:
-        value: jax.Array = family.psi(*jnp.asarray(arguments), **varied, **fixed)
-        return value
-
-    return {key: np.asarray(value) for key, value in jax.grad(psi)(inexact).items()}
+def _slopes(family: Family, arguments: Floats, parameters: dict[str, Floats]) -> dict[str, Floats]:
+    """∂ψ/∂p of one member, for each of its parameters."""
+    slopes: dict[str, jax.Array] = jax.grad(lambda varied: family.psi(*jnp.asarray(arguments), **varied))(parameters)
+    return {key: np.asarray(value) for key, value in slopes.items()}
 
 
 @dataclass(frozen=True)
@@ -228,21 +222,19 @@ class _Slackened:
 
 def turned(team: Team, knob: _Knob, amount: float) -> Team:
     """The team with one constraint relaxed by `amount`."""
-    families = []
-    for family in team.families:
-        here = family.number == knob.constraint
-        if not here.any():
-            families.append(family)
-        elif knob.parameter:
-            changed = family.parameters[knob.parameter].copy()
-            changed[(int(np.argmax(here)), *knob.entry)] += knob.sign * amount
-            families.append(dataclasses.replace(family, parameters={**family.parameters, knob.parameter: changed}))
-        else:
-            single = family.members(here)
-            slack = {**single.parameters, "slack": np.full(1, amount)}
-            families.append(dataclasses.replace(single, psi=_Slackened(family.psi), parameters=slack, sources=None))
-            if not here.all():
-                families.append(family.members(~here))
+    f, member = team.slots[knob.constraint].tolist()
+    families = list(team.families)
+    family = families[f]
+    if knob.parameter:
+        changed = family.parameters[knob.parameter].copy()
+        changed[(member, *knob.entry)] += knob.sign * amount
+        families[f] = dataclasses.replace(family, parameters={**family.parameters, knob.parameter: changed})
+    else:
+        here = np.arange(family.size) == member
+        single, others = family.members(here), family.members(~here)
+        slack = {**single.parameters, "slack": np.full(1, amount)}
+        slackened = dataclasses.replace(single, psi=_Slackened(family.psi), parameters=slack, sources=None)
+        families[f : f + 1] = [slackened, others] if others.size else [slackened]
     return team.with_constraints(families, team.owner, team.names)
 
 
@@ -280,12 +272,11 @@ def _listed(team: Team, constraints: list[int]) -> str:
 def _label(team: Team, constraint: int) -> str:
     """Label of a constraint: ``a2's tether to a3``, or ``a2's near(a3)`` if the name already contains the other agents."""
     owner, name = int(team.owner[constraint]), team.names[constraint]
-    for family in team.families:
-        for member in np.flatnonzero(family.number == constraint):
-            others = [team.ids[i] for i in family.agents[member].tolist() if i != owner]
-            if others and not name.startswith(f"{family.kind}("):
-                return f"{team.ids[owner]}'s {name} to {', '.join(others)}"
-    return f"{team.ids[owner]}'s {name}"
+    f, member = team.slots[constraint].tolist()
+    family = team.families[f]
+    others = [team.ids[i] for i in family.agents[member].tolist() if i != owner]
+    to = f" to {', '.join(others)}" if others and not name.startswith(f"{family.kind}(") else ""
+    return f"{team.ids[owner]}'s {name}{to}"
 
 
 def _number(value: float, digits: int = 4) -> str:

@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from consat.certify.quadratics import Bools, Expansion, Floats, Ints
+from consat.problem.graphs import components
 
 FLAT = 1e-10
 """Relative changes of ψ below this count as 0. Two walls that are parallel to ten digits are therefore treated as parallel."""
@@ -103,9 +103,7 @@ def _merged(model: Expansion) -> tuple[Ints, list[sparse.csr_array]]:
             columns = np.repeat(block.columns[rest], n, axis=0)
             start = np.arange(len(rows) + 1) * n
             left.append(sparse.csr_array((rows.ravel(), columns.ravel(), start), shape=(len(rows), model.size)))
-    edges = np.concatenate(pairs)
-    graph = sparse.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(agents, agents))
-    label = connected_components(graph, directed=False)[1]
+    label = components(np.concatenate(pairs), agents)
     free = np.ones(int(label.max(initial=-1)) + 1, dtype=bool)
     free[label[held]] = False
     number = np.where(free, np.cumsum(free) - 1, -1)

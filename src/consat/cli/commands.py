@@ -248,16 +248,20 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     from consat.certify.assumptions import report
     from consat.problem.graphs import require_connected
     from consat.runs.preparation import told
-    from consat.scenario.robots import blocked_goals
-    from consat.views import tables
 
     findings = report(loaded.team)
     if findings["communication_connected"]:
         findings |= told(loaded.team, loaded.settings.protocol)
-    findings["warnings"] = [] if loaded.robots is None else blocked_goals(loaded.robots, loaded.team)
+    findings["warnings"] = []
+    if loaded.robots is not None:
+        from consat.scenario.robots import blocked_goals
+
+        findings["warnings"] = blocked_goals(loaded.robots, loaded.team)
     if as_json:
         click.echo(json.dumps(findings))
     else:
+        from consat.views import tables
+
         show_rich(tables.check(loaded.name, findings))
     with located(loaded):
         require_connected(loaded.team)
@@ -278,7 +282,6 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     keep_compilations(os.environ)
     loaded = _load(scenario, overrides)
     from consat.runs.solving import solve as solve_team
-    from consat.views import tables
 
     with located(loaded):
         answer = solve_team(loaded, seed=seed, auxiliary=auxiliary)
@@ -287,6 +290,8 @@ def solve(scenario: str, overrides: tuple[str, ...], seed: int, auxiliary: float
     if as_json:
         click.echo(json.dumps(answer))
     else:
+        from consat.views import tables
+
         show_rich(tables.solve(answer))
     return DONE if answer["verdict"] == "feasible" else UNSATISFIED
 

@@ -14,8 +14,7 @@ from jax import Array
 from consat.engine.bodies import Body
 from consat.engine.live import Live
 from consat.faults import Faults
-from consat.numerics import Groups, on_device, pick
-from consat.problem.family import distinct
+from consat.numerics import Groups, distinct, on_device, pick
 from consat.problem.graphs import hops
 from consat.problem.objective import Nu, Objective
 from consat.problem.team import Team

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,12 +12,9 @@ from consat.errors import Fault, InvalidTeam, closest, shown
 from consat.problem.constraints.library import ADJUSTABLE, adjustable
 from consat.problem.constraints.record import Number, Vector, flatten
 from consat.problem.family import Family
-from consat.problem.parameters import Moving, checked, still
+from consat.problem.parameters import Moving, Spot, checked, still
 from consat.problem.schedule import Schedule
 from consat.problem.team import Team
-
-WEIGHT: Final = Number(None, positive=True)
-"""What the weight of a constraint must satisfy."""
 
 
 class Change(NamedTuple):
@@ -61,7 +58,7 @@ def changes_of(
 def is_structural(team: Team, changes: Sequence[Change]) -> bool:
     """Whether a change affects a weight, a schedule, or a parameter that moves with time. Rounds must then be compiled again."""
     return any(
-        key == "weight" or isinstance(value, Schedule) or _moves(team.families[change.family], key, change.member)
+        key == "weight" or isinstance(value, Schedule) or isinstance(parameter(team, change.number, key), Schedule)
         for change in changes
         for key, value in change.given.items()
     )
@@ -143,7 +140,7 @@ def _sides(
     own = {side: next(k for k in numbers if f".{side}[" in team.names[k]) for side in ("low", "high")}
     limits = {side: parameters.get(side, parameter(team, k, side, now)) for side, k in own.items()}
     faults: list[Fault] = []
-    checked(Vector(limits["high"], above=limits["low"]), team.dimension, ("high",), "high", where, faults)
+    checked(Vector(limits["high"], above=limits["low"]), team.dimension, Spot(("high",), "high", where, faults))
     if faults:
         raise InvalidTeam(faults)
     return [
@@ -166,14 +163,15 @@ def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) 
     where = f"agent {team.ids[team.owner[number]]!r}, constraint {team.names[number]!r}"
     faults: list[Fault] = []
     values: dict[str, Moving] = {}
-    allowed = adjustable(family.kind, family.psi, family.parameters)
+    own = adjustable(family.kind, family.psi, family.parameters)
+    allowed = {**own, "weight": Number(None, positive=True)}
     for key, value in given.items():
-        if key not in allowed and key != "weight":
-            names = ", ".join([*allowed, "weight"])
-            faults.append(Fault((key,), f"there is no parameter {key!r} to change{closest(key, allowed)}; it has {names}", where))
+        if key not in allowed:
+            message = f"there is no parameter {key!r} to change{closest(key, own)}; it has {', '.join(allowed)}"
+            faults.append(Fault((key,), message, where))
             continue
-        parameter = dataclasses.replace(allowed.get(key, WEIGHT), value=value)
-        found = (still if key == "weight" else checked)(parameter, team.dimension, (key,), key, where, faults)
+        parameter = dataclasses.replace(allowed[key], value=value)
+        found = (still if key == "weight" else checked)(parameter, team.dimension, Spot((key,), key, where, faults))
         if found is None:
             continue
         shape = family.parameters[key].shape[1:] if key != "weight" else ()
@@ -183,8 +181,3 @@ def _checked(team: Team, number: int, family: Family, given: Mapping[str, Any]) 
     if faults:
         raise InvalidTeam(faults)
     return values
-
-
-def _moves(family: Family, key: str, member: int) -> bool:
-    track = family.tracks.get(key)
-    return track is not None and track.schedule(int(member)) is not None

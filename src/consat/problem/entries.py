@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import functools
 import types
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import numpy as np
 
-from consat.errors import Fault, InvalidExpression
+from consat.errors import Fault, InvalidExpression, shown
 from consat.numerics import float64
 from consat.problem.constraints.record import OWNER, Constraint, Number, flatten
-from consat.problem.family import FamilyPart
+from consat.problem.family import Family
 from consat.problem.index import SUGGESTIONS, Index, who_is
-from consat.problem.parameters import Path, checked, still
+from consat.problem.parameters import Path, Spot, checked, is_printable, still
 from consat.problem.schedule import Schedule, Track
 
 
-@dataclass
+@dataclass(slots=True)
 class Entry:
     """One checked constraint that is not yet in a family.
 
@@ -46,13 +46,6 @@ class Entry:
     weight: float = 1.0
     moving: dict[str, Schedule] = field(default_factory=dict)
 
-    def take(self, key: str, value: np.ndarray | Schedule) -> None:
-        """Store a checked parameter: a constant array or a schedule."""
-        if isinstance(value, Schedule):
-            self.moving[key] = value
-            value = value.at(0.0)
-        self.values[key] = value
-
     @property
     def family(self) -> tuple[Any, ...]:
         """Key of the family: the function, the number of positions, and the shapes of the parameters."""
@@ -77,9 +70,10 @@ def trace(entries: Iterable[Entry], dimension: int, faults: list[Fault]) -> None
     """Trace ψ once per family, so that errors in a user's function are found before anything runs. Adds to `faults`."""
     seen: dict[tuple[Any, ...], Fault | None] = {}
     for entry in entries:
-        first = entry.family not in seen
-        fault = seen.setdefault(entry.family, _untraceable(entry, dimension) if first else None)
-        if fault is not None and not first:
+        family = entry.family
+        if family not in seen:
+            fault = seen[family] = _untraceable(entry, dimension)
+        elif (fault := seen[family]) is not None:
             written = entry.constraint.source is not None and len(faults) < SUGGESTIONS
             # Expressions of one family may be written differently, so the column of the error differs.
             again = _untraceable(entry, dimension) if written else None
@@ -112,41 +106,29 @@ def _mistake(entry: Entry, dimension: int) -> tuple[str, int]:
     return "", 0
 
 
-def alike(entries: Sequence[Entry]) -> list[FamilyPart]:
-    """Groups entries by family: one `FamilyPart` per family."""
-    members: dict[tuple[Any, ...], list[Entry]] = {}
-    turns: dict[tuple[Any, ...], list[int]] = {}
-    for turn, entry in enumerate(entries):
-        members.setdefault(entry.family, []).append(entry)
-        turns.setdefault(entry.family, []).append(turn)
-    return [
-        FamilyPart(
-            kind=group[0].constraint.kind,
-            psi=group[0].constraint.psi,
+def alike(entries: Iterable[Entry]) -> list[tuple[Family, Sequence[str]]]:
+    """Groups entries by family. Returns: the families and the names of their constraints, whose `number` is the index of the entry."""
+    members: dict[tuple[Any, ...], list[tuple[int, Entry]]] = {}
+    for number, entry in enumerate(entries):
+        members.setdefault(entry.family, []).append((number, entry))
+    made: list[tuple[Family, Sequence[str]]] = []
+    for numbers, group in (zip(*pairs, strict=True) for pairs in members.values()):
+        first = group[0]
+        texts = tuple(entry.constraint.source for entry in group)
+        moving = {key: {row: entry.moving[key] for row, entry in enumerate(group) if key in entry.moving} for key in first.values}
+        family = Family(
+            kind=first.constraint.kind,
+            psi=first.constraint.psi,
             agents=np.array([entry.agents for entry in group], dtype=np.int32),
             owner=np.array([entry.owner for entry in group], dtype=np.int32),
-            parameters={key: np.stack([entry.values[key] for entry in group]) for key in group[0].values},
+            number=np.array(numbers),
+            parameters={key: np.stack([entry.values[key] for entry in group]) for key in first.values},
             weight=np.array([entry.weight for entry in group]),
-            names=tuple(entry.name for entry in group),
-            sources=_sources(group),
-            turn=np.array(turns[family]),
-            tracks=_tracks(group),
+            sources=None if None in texts else texts,
+            tracks={key: Track.of(each) for key, each in moving.items() if each},
         )
-        for family, group in members.items()
-    ]
-
-
-def _tracks(entries: Sequence[Entry]) -> dict[str, Track]:
-    found: dict[str, dict[int, Schedule]] = {}
-    for row, entry in enumerate(entries):
-        for key, moving in entry.moving.items():
-            found.setdefault(key, {})[row] = moving
-    return {key: Track.of(each) for key, each in found.items()}
-
-
-def _sources(entries: Sequence[Entry]) -> tuple[str, ...] | None:
-    texts = tuple(entry.constraint.source for entry in entries if entry.constraint.source is not None)
-    return texts if len(texts) == len(entries) else None
+        made.append((family, tuple(entry.name for entry in group)))
+    return made
 
 
 def entries_of(index: Index, dimension: int, faults: list[Fault]) -> Iterator[Entry]:
@@ -166,28 +148,29 @@ def entries_of(index: Index, dimension: int, faults: list[Fault]) -> Iterator[En
                 if not isinstance(constraint, Constraint):
                     faults.append(Fault(path, f"{constraint!r} is no constraint; use consat.within and its like", who))
                     continue
-                named = len(faults)
+                known = len(faults)
                 name = _name(constraint, taken, path, agent.id, who, faults)
                 where = f"{who}, constraint {name!r}"
-                reads = _reads(constraint, agent.id, index, path, where, faults)
-                entry = Entry(constraint, i, reads, name, path, where)
+                spot = Spot(path, "", where, faults)
+                reads = _reads(constraint, agent.id, index, spot)
+                values: dict[str, np.ndarray] = {}
+                moving: dict[str, Schedule] = {}
                 for key, parameter in constraint.parameters.items():
-                    value = checked(parameter, dimension, (*path, key), key, where, faults)
+                    value = checked(parameter, dimension, spot.under(key))
+                    if isinstance(value, Schedule):
+                        moving[key], value = value, value.at(0.0)
                     if value is not None:
-                        entry.take(key, value)
-                weight = still(Number(constraint.weight, positive=True), dimension, (*path, "weight"), "weight", where, faults)
-                entry.weight = 1.0 if weight is None else float(weight)
-                if len(faults) == named and reads:
-                    yield entry
+                        values[key] = value
+                weight = still(Number(constraint.weight, positive=True), dimension, spot.under("weight"))
+                if len(faults) == known and reads and weight is not None:
+                    yield Entry(constraint, i, reads, name, path, where, values, float(weight), moving)
 
 
 def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str, who: str, faults: list[Fault]) -> str:
     """The name that the user gave, or one derived from the kind and the other agents, with a number if it would repeat."""
     if constraint.name is not None:
-        if not isinstance(constraint.name, str) or not constraint.name.strip() or not constraint.name.isprintable():
-            faults.append(Fault((*path, "name"), f"name is {constraint.name!r}, but must be a printable text", who))
-        elif constraint.name in taken:
-            message = f"name {constraint.name!r} is taken by another constraint of {who}; choose another"
+        message = wrong_name(constraint.name, taken, who)
+        if message:
             faults.append(Fault((*path, "name"), message, who))
         else:
             taken[constraint.name] = 1
@@ -202,23 +185,26 @@ def _name(constraint: Constraint, taken: dict[str, int], path: Path, owner: str,
     return name
 
 
-def _reads(constraint: Constraint, owner: str, index: Index, path: Path, where: str, faults: list[Fault]) -> tuple[int, ...]:
-    key: Path = ("psi",) if constraint.source is not None else ("agent",)
+def wrong_name(name: Any, taken: Container[str], whose: str) -> str | None:
+    """What is wrong with a name given to a constraint; None if it is valid and not among those `taken` by constraints of the same owner."""
+    if not is_printable(name):
+        return f"name is {shown(name)}, but must be a printable text"
+    return f"name {name!r} is taken by another constraint of {whose}; choose another" if name in taken else None
+
+
+def _reads(constraint: Constraint, owner: str, index: Index, spot: Spot) -> tuple[int, ...]:
+    key = "psi" if constraint.source is not None else "agent"
     reads: list[str] = []
     for agent in constraint.reads:
         if isinstance(agent, str) and (agent == OWNER or agent in index):
             reads.append(owner if agent == OWNER else agent)
         else:
-            faults.append(Fault((*path, *key), index.unknown(agent, faults), where))
+            spot.fault(index.unknown(agent, spot.faults), key)
     if not isinstance(owner, str) or owner not in index:
         return ()  # the owner's id has a fault, which `Index` reports
     if owner not in reads:
-        faults.append(Fault((*path, *key), f"it must read the position of its owner {owner!r}, but reads {_listed(reads)}", where))
+        spot.fault(f"it must read the position of its owner {owner!r}, but reads {', '.join(map(repr, reads)) or 'nothing'}", key)
     if repeated := next((agent for agent in reads if reads.count(agent) > 1), None):
         itself = "its own owner" if repeated == owner else "the same agent twice"
-        faults.append(Fault((*path, *key), f"it names {itself}, {repeated!r}; name another agent", where))
+        spot.fault(f"it names {itself}, {repeated!r}; name another agent", key)
     return tuple(index[agent] for agent in reads)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names)) or "nothing"

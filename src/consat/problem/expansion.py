@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from consat.errors import Fault, shown
 from consat.problem.constraints.record import OWNER, Constraint, Number, Vector, flatten
-from consat.problem.family import Derived, FamilyPart, Repeated
+from consat.problem.entries import Entry, trace, wrong_name
+from consat.problem.family import Family
 from consat.problem.groups import ACROSS, OTHER, PLACE, SELF, Each, Group, Ints, Layout, label, layout
-from consat.problem.parameters import Path, checked, checked_rows
+from consat.problem.index import Index
+from consat.problem.names import Derived
+from consat.problem.parameters import Path, Spot, checked, checked_rows
 from consat.problem.schedule import Schedule, Track
 
 
@@ -23,8 +26,7 @@ class Expansion:
     Attributes:
         group: a group without faults; see `faults_of`.
         first: index of its first member in the team.
-        ids: ids of the team.
-        find: function from an id to its index in the team, or None.
+        index: ids of the team.
         dimension: d.
         path: place of the group in the input, for faults.
         faults: list to which faults are added.
@@ -33,8 +35,7 @@ class Expansion:
 
     group: Group
     first: int
-    ids: Sequence[str]
-    find: Any
+    index: Index
     dimension: int
     path: Path
     faults: list[Fault]
@@ -43,19 +44,25 @@ class Expansion:
     def __post_init__(self) -> None:
         self.layout = layout(self.group, self.dimension)
 
-    def parts(self) -> list[tuple[FamilyPart, Constraint, Path, str]]:
-        """For each constraint of the group: the part with one row per owner, the constraint, and its place in the input, for faults."""
-        made: list[tuple[FamilyPart, Constraint, Path, str]] = []
-        named: dict[str, Path] = {}
-        for path, entry in self.entries():
-            constraint = entry.constraint
+    def parts(self) -> list[tuple[Family, Sequence[str]]]:
+        """For each constraint of the group that a member owns: the family with one row per owner, and the names."""
+        made: list[tuple[Family, Entry]] = []
+        taken: set[str] = set()
+        for path, each in self.entries():
+            constraint = each.constraint
             where = f"{label(self.group)}, constraint {constraint.name or constraint.kind!r}"
-            if constraint.name is not None and not self.good_name(constraint.name, named, path, where):
-                continue
-            part = self.part(entry, path, where)
-            if part is not None:
-                made.append((part, constraint, path, where))
-        return self.told_apart(made)
+            spot = Spot(path, "", where, self.faults)
+            if constraint.name is not None:
+                if message := wrong_name(constraint.name, taken, label(self.group)):
+                    spot.fault(message, "name")
+                    continue
+                taken.add(constraint.name)
+            family = self.family(each, spot)
+            if family is not None and family.size:
+                first = {key: value[0] for key, value in family.parameters.items()}
+                made.append((family, Entry(constraint, self.first, tuple(range(family.arity)), "", path, where, first)))
+        trace((entry for _, entry in made), self.dimension, self.faults)
+        return self.named([(family, entry.constraint) for family, entry in made])
 
     def entries(self) -> Iterator[tuple[Path, Each]]:
         """(path, constraint with its owners) for each constraint of the group; nested lists are flattened."""
@@ -71,54 +78,42 @@ class Expansion:
                     message = f"{constraint!r} is no constraint; use consat.within and its like"
                     self.faults.append(Fault(path, message, label(self.group)))
 
-    def good_name(self, name: Any, named: dict[str, Path], path: Path, where: str) -> bool:
-        """Whether a given name is valid and new in the group. Adds it to `named`, or a fault."""
-        if not isinstance(name, str) or not name.strip() or not name.isprintable():
-            self.faults.append(Fault((*path, "name"), f"name is {shown(name)}, but must be a printable text", where))
-        elif name in named:
-            message = f"name {name!r} is taken by another constraint of {label(self.group)}; choose another"
-            self.faults.append(Fault((*path, "name"), message, where))
-        else:
-            named[name] = path
-            return True
-        return False
-
-    def part(self, entry: Each, path: Path, where: str) -> FamilyPart | None:
-        """The part for one constraint of the group, with one row per owner and agent read, without names; None if it has faults."""
-        constraint, known = entry.constraint, len(self.faults)
-        rows = self.members(entry.of, path, where)
-        slots = self.slots(constraint, entry.agent, path, where)
+    def family(self, each: Each, spot: Spot) -> Family | None:
+        """The family of one constraint of the group, with one row per owner and agent read, not numbered; None if it has faults."""
+        constraint, known = each.constraint, len(self.faults)
+        rows = self.members(each.of, spot)
+        reads, relation = self.slots(constraint, each.agent, spot)
         if len(self.faults) > known:
             return None
-        row, other = self.related(slots.relation, rows, path, where)
-        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in slots.reads]
+        row, other = self.related(relation, rows, spot)
+        columns = [row + self.first if kind == OWNER else other if kind == OTHER else np.full(len(row), kind) for kind in reads]
         values, tracks = {}, {}
         for key, parameter in constraint.parameters.items():
-            value = self.values(parameter, row, other, (*path, key), key, where)
+            value = self.values(parameter, row, other, spot.under(key))
             if isinstance(value, Schedule):
                 many = len(row)
                 times, places = (np.broadcast_to(each, (many, *each.shape)) for each in (value.times, value.values))
                 tracks[key] = Track(np.arange(many, dtype=np.int32), times, places)
                 value = np.broadcast_to(value.at(0.0), (many, *value.values.shape[1:]))
             values[key] = value
-        weight = self.values(Number(constraint.weight, positive=True), row, other, (*path, "weight"), "weight", where)
+        weight = self.values(Number(constraint.weight, positive=True), row, other, spot.under("weight"))
         if isinstance(weight, Schedule):
-            self.faults.append(Fault((*path, "weight"), "weight moves with time, but must be a positive number", where))
+            spot.fault("weight moves with time, but must be a positive number", "weight")
         if len(self.faults) > known or isinstance(weight, Schedule):
             return None
-        return FamilyPart(
+        return Family(
             kind=constraint.kind,
             psi=constraint.psi,
             agents=np.stack(columns, axis=1).astype(np.int32),
             owner=(row + self.first).astype(np.int32),
+            number=np.zeros(len(row), dtype=np.int32),
             parameters=values,
             weight=weight,
-            names=(),
-            sources=None if constraint.source is None else Repeated(constraint.source, len(row)),
+            sources=None if constraint.source is None else (constraint.source,) * len(row),
             tracks=tracks if len(row) else {},
         )
 
-    def members(self, of: Any, path: Path, where: str) -> Ints:
+    def members(self, of: Any, spot: Spot) -> Ints:
         """The indices, in the group, of the members that own a constraint; see `each` for `of`."""
         count = self.group.count
         if of is None:
@@ -126,33 +121,26 @@ class Expansion:
         if isinstance(of, np.ndarray) and of.ndim == 1 and of.dtype.kind in "iu":
             if not len(of) or (of.min() >= 0 and of.max() < count):
                 return of.astype(np.int64)
-            self.faults.append(Fault((*path, "of"), f"of holds places beyond 0 to {count - 1}", where))
+            spot.fault(f"of holds places beyond 0 to {count - 1}", "of")
             return np.arange(0)
         if of in ("first", "last"):
             return np.array([0 if of == "first" else count - 1])
         if isinstance(of, Mapping) and list(of) == ["every"] and type(of["every"]) is int and of["every"] >= 1:
             return np.flatnonzero((self.layout.steps % of["every"] == 0).all(axis=1))
         chosen = of if isinstance(of, list | tuple) else [of]
-        places = [self.find(name) for name in chosen if isinstance(name, str)]
+        places = [self.index.get(name) for name in chosen if isinstance(name, str)]
         inside = [place - self.first for place in places if place is not None and 0 <= place - self.first < count]
         if len(inside) != len(chosen) or not inside:
             example = f"first, last, {{every: 10}}, or ids of the group such as [{self.group.name}1]"
-            self.faults.append(Fault((*path, "of"), f"of is {shown(of)}, but must be one of {example}", where))
+            spot.fault(f"of is {shown(of)}, but must be one of {example}", "of")
         return np.unique(np.array(inside, dtype=np.int64))
 
-    class Slots(NamedTuple):
-        """The positions that ψ takes.
+    def slots(self, constraint: Constraint, agent: Any, spot: Spot) -> tuple[list[Any], Any]:
+        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`.
 
-        Attributes:
-            reads: `OWNER`, `OTHER`, or the index of an agent in the team, for each position.
-            relation: how `OTHER` is found; None if ψ does not read it.
+        Returns:
+            `OWNER`, `OTHER`, or the index of an agent in the team, for each position; and how `OTHER` is found, None if ψ does not read it.
         """
-
-        reads: list[Any]
-        relation: Any
-
-    def slots(self, constraint: Constraint, agent: Any, path: Path, where: str) -> Slots:
-        """Resolve the positions that a constraint reads. `agent` is the relation of a text expression; see `each`."""
         reads: list[Any] = []
         relation: Any = None
         written = constraint.source is not None
@@ -162,26 +150,26 @@ class Expansion:
             elif not isinstance(read, str) or (written and read == OTHER):
                 relation = agent if isinstance(read, str) else read
                 reads.append(OTHER)
-            elif (place := self.find(read)) is not None:
+            elif (place := self.index.get(read)) is not None:
                 reads.append(place)
             else:
                 relative = f"; in a group, {SELF} is the member and {OTHER} the one that `agent` tells of" if written else ""
                 key = "psi" if written else "agent"
-                self.faults.append(Fault((*path, key), f"there is no agent {shown(read)}{relative}", where))
+                spot.fault(f"there is no agent {shown(read)}{relative}", key)
         if OWNER not in reads and not self.faults:
             key = "psi" if written else "agent"
-            self.faults.append(Fault((*path, key), f"it must read the position of its owner, {SELF}, but does not", where))
+            spot.fault(f"it must read the position of its owner, {SELF}, but does not", key)
         if OTHER in reads and relation is None:
             message = f"agent is missing: it tells who `{OTHER}` is, such as -1 for the one ahead"
-            self.faults.append(Fault((*path, "agent"), message, where))
+            spot.fault(message, "agent")
         elif agent is not None and OTHER not in reads:
-            self.faults.append(Fault((*path, "agent"), f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", where))
+            spot.fault(f"agent tells who `{OTHER}` is, but psi does not read `{OTHER}`", "agent")
         fixed = [read for read in reads if isinstance(read, int)]
         if len(set(fixed)) < len(fixed):
-            self.faults.append(Fault((*path, "agent"), "it names the same agent twice; name another agent", where))
-        return self.Slots(reads, relation)
+            spot.fault("it names the same agent twice; name another agent", "agent")
+        return reads, relation
 
-    def related(self, relation: Any, rows: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
+    def related(self, relation: Any, rows: Ints, spot: Spot) -> tuple[Ints, Ints]:
         """Resolve a relation for the owners `rows`.
 
         Returns:
@@ -192,7 +180,9 @@ class Expansion:
         if isinstance(relation, np.ndarray):
             inside = (relation >= 0) & (relation < self.group.count) if relation.dtype.kind in "iu" else np.zeros(1, dtype=bool)
             if relation.shape == rows.shape and inside.all():
-                return self.apart_from_itself(rows, relation.astype(np.int64), path, where)
+                if (rows == relation).any():
+                    spot.fault("agent names the owner itself for some of these constraints", "agent")
+                return rows, relation.astype(np.int64) + self.first
             message = f"agent must be an array of {len(rows)} places from 0 to {self.group.count - 1}, one for each of these constraints"
         elif isinstance(relation, Mapping):
             k = relation.get("nearest")
@@ -209,14 +199,8 @@ class Expansion:
                 f"agent is {shown(relation)}, but must be an id, a whole number other than 0, such as -1 for the one ahead{grid}, "
                 "or {nearest: k}"
             )
-        self.faults.append(Fault((*path, "agent"), message, where))
+        spot.fault(message, "agent")
         return rows[:0], rows[:0]
-
-    def apart_from_itself(self, rows: Ints, others: Ints, path: Path, where: str) -> tuple[Ints, Ints]:
-        """Resolve an array of indices. Adds a fault if it names an owner itself."""
-        if (rows == others).any():
-            self.faults.append(Fault((*path, "agent"), "agent names the owner itself for some of these constraints", where))
-        return rows, others + self.first
 
     def shifted(self, steps: list[int], rows: Ints) -> tuple[Ints, Ints]:
         """Resolve an offset along the group (one step) or along the axes of its grid (d steps)."""
@@ -244,47 +228,45 @@ class Expansion:
         itself[~itself.any(axis=1), -1] = True  # where places coincide, the owner may be missing among those found
         return np.repeat(rows, k), found[~itself].reshape(-1, k).ravel() + self.first
 
-    def values(self, parameter: Any, row: Ints, other: Ints, path: Path, key: str, where: str) -> np.ndarray | Schedule:
+    def values(self, parameter: Any, row: Ints, other: Ints, spot: Spot) -> np.ndarray | Schedule:
         """(M, …) values of one parameter, or one schedule for all. Placeholder values if a fault was added."""
-        value, places = parameter.value, self.layout.places
+        value, places, key = parameter.value, self.layout.places, spot.name
         if isinstance(parameter, Vector) and isinstance(value, str) and value == ACROSS and key == "center":
             return -places[row]
         if isinstance(parameter, Vector) and isinstance(value, str) and value == PLACE and key in ("center", "vector"):
             return places[row] - places[other - self.first] if key == "vector" else places[row]
-        if isinstance(value, np.ndarray) and value.ndim == (2 if isinstance(parameter, Vector) else 1) and not _fixed(parameter):
-            rows = checked_rows(parameter, (len(row), self.dimension), path, key, where, self.faults)
+        if (
+            isinstance(value, np.ndarray)
+            and value.ndim == (2 if isinstance(parameter, Vector) else 1)
+            and isinstance(parameter, Number | Vector)
+        ):
+            rows = checked_rows(parameter, (len(row), self.dimension), spot)
             return np.zeros(len(row)) if rows is None else rows
-        one = checked(parameter, self.dimension, path, key, where, self.faults)
+        one = checked(parameter, self.dimension, spot)
         if isinstance(one, Schedule):
             return one
         return np.zeros(len(row)) if one is None else np.broadcast_to(one, (len(row), *one.shape))
 
-    def told_apart(self, made: list[tuple[FamilyPart, Constraint, Path, str]]) -> list[tuple[FamilyPart, Constraint, Path, str]]:
-        """The same list with names. A name that one owner would have twice gets a number."""
+    def named(self, made: list[tuple[Family, Constraint]]) -> list[tuple[Family, Sequence[str]]]:
+        """The families, numbered by their order in the group, with names. A name that one owner would have twice gets a number."""
         stems: dict[str, list[int]] = {}
         others = []
-        for p, (part, constraint, _, _) in enumerate(made):
-            reads = part.agents if constraint.name is None else part.agents[:, :0]
-            others.append(_others(reads, part.owner))
+        for p, (family, constraint) in enumerate(made):
+            reads = family.agents if constraint.name is None else family.agents[:, :0]
+            others.append(_others(reads, family.owner))
             stems.setdefault(constraint.name or f"{constraint.kind}({others[p].shape[1]})", []).append(p)
-        named = list(made)
+        names: dict[int, Sequence[str]] = {}
         for parts in stems.values():
             owner = np.concatenate([made[p][0].owner for p in parts])
-            keys = [owner, *np.concatenate([others[p] for p in parts]).T]
-            rank, start = _ranks(keys), 0
-            for p in parts:
-                part, constraint, path, where = made[p]
-                stop = start + len(part.owner)
-                ids = self.ids if constraint.name is None else None
-                mine = rank[start:stop] if rank is not None else None
-                names = Derived(constraint.name or constraint.kind, ids, others[p], mine)
-                named[p] = replace(part, names=names), constraint, path, where
-                start = stop
-        return named
-
-
-def _fixed(parameter: Any) -> bool:
-    return not isinstance(parameter, Number | Vector)
+            rank = _ranks([owner, *np.concatenate([others[p] for p in parts]).T])
+            ends = np.cumsum([len(others[p]) for p in parts])[:-1]
+            mine = [None] * len(parts) if rank is None else np.split(rank, ends)
+            for p, again in zip(parts, mine, strict=True):
+                constraint = made[p][1]
+                names[p] = Derived(
+                    constraint.name or constraint.kind, self.index.ids if constraint.name is None else None, others[p], again
+                )
+        return [(replace(family, number=family.number + p), names[p]) for p, (family, _) in enumerate(made)]
 
 
 def _others(agents: np.ndarray, owner: np.ndarray) -> np.ndarray:

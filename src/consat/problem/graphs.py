@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from consat.errors import Fault, InvalidTeam
-from consat.problem.family import distinct
+from consat.problem.links import pair_keys, task_pairs, unique_pairs
 from consat.problem.team import Team
 
 
@@ -23,17 +23,7 @@ def task_edges(team: Team) -> np.ndarray:
     Returns:
         (E, 2) int32, sorted, each edge once.
     """
-    return _unique_pairs(_reads(team), team.count)
-
-
-def _reads(team: Team) -> np.ndarray:
-    """(E', 2) int32 edges of the task graph, unsorted, one for each constraint and position read: edges may repeat."""
-    edges = [np.zeros((0, 2), dtype=np.int32)]
-    for family in team.families:
-        for slot in range(family.arity):
-            pairs = np.stack([family.owner, family.agents[:, slot]], axis=1)
-            edges.append(pairs if family.arity == 1 else pairs[pairs[:, 0] != pairs[:, 1]])
-    return np.concatenate(edges)
+    return unique_pairs(task_pairs(team.families), team.count)
 
 
 def clusters(team: Team) -> np.ndarray:
@@ -42,7 +32,15 @@ def clusters(team: Team) -> np.ndarray:
     Returns:
         (N,) int32 labels from 0; clusters are numbered by their first agent.
     """
-    return _components(_reads(team), team.count)
+    return components(task_pairs(team.families), team.count)
+
+
+def members(team: Team, cluster: np.ndarray) -> list[list[str]]:
+    """The ids of the agents of each cluster. `cluster`: (N,) as `clusters` returns."""
+    found: list[list[str]] = [[] for _ in range(int(cluster.max(initial=-1)) + 1)]
+    for agent, label in zip(team.ids, cluster.tolist(), strict=True):
+        found[label].append(agent)
+    return found
 
 
 def cluster_links(team: Team, cluster: np.ndarray) -> np.ndarray:
@@ -67,7 +65,7 @@ def disconnected(team: Team) -> list[list[list[str]]]:
 
 def _broken(team: Team, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) label of the connected part of each agent, over links inside clusters only; and the labels of clusters with several parts."""
-    part = _components(cluster_links(team, cluster), team.count)
+    part = components(cluster_links(team, cluster), team.count)
     first = np.full(cluster.max() + 1, -1)
     first[cluster[::-1]] = part[::-1]
     return part, np.unique(cluster[part != first[cluster]])
@@ -95,7 +93,7 @@ def relays(team: Team, cluster: np.ndarray) -> dict[int, set[int]]:
         allowed = (cluster == c) | free
         links = team.links[allowed[team.links].all(axis=1)]
         members = np.flatnonzero(cluster == c)
-        if len(np.unique(_components(links, team.count)[members])) == 1:
+        if len(np.unique(components(links, team.count)[members])) == 1:
             found[c] = _steiner(int(members[0]), set(members[1:].tolist()), _adjacency(links, team.count))
     return found
 
@@ -126,15 +124,7 @@ def hops(count: int, links: np.ndarray) -> int:
         count: N, the number of agents.
         links: (L, 2) pairs of agents.
     """
-    labels = _components(links, count)
-    starts = np.unique(labels, return_index=True)[1]
-    longest = 0
-    for _ in range(2):
-        depth, order = _depths(links, count, starts)
-        longest = max(longest, int(depth.max(initial=0)))
-        starts = np.zeros(len(starts), dtype=np.intp)
-        starts[labels[order]] = order  # the last write wins: the deepest agent of each component
-    return longest
+    return max((int(depth.max(initial=0)) for depth, _ in _sweeps(links, count, components(links, count), 2)), default=0)
 
 
 def loop_length(count: int, links: np.ndarray) -> float:
@@ -147,8 +137,7 @@ def loop_length(count: int, links: np.ndarray) -> float:
         count: N, number of agents.
         links: (L, 2) undirected links, each once.
     """
-    whole = coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count))
-    loops = len(links) - count + int(connected_components(whole, directed=False, return_labels=False))
+    loops = len(links) - count + int(components(links, count).max(initial=-1)) + 1
     if not loops:
         return 0.0
     kept = np.zeros(len(links), dtype=bool)
@@ -157,6 +146,16 @@ def loop_length(count: int, links: np.ndarray) -> float:
         kept = (degree[links] > 1).all(axis=1)
         links = links[kept]
     return 2.0 * len(links) / (loops + 1)
+
+
+def _sweeps(links: np.ndarray, count: int, component: np.ndarray, times: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Breadth-first searches over all components, each from the agents farthest from the starts of the one before; as `_depths` returns."""
+    starts = np.unique(component, return_index=True)[1]
+    for _ in range(times):
+        depth, order = _depths(links, count, starts)
+        yield depth, order
+        starts = np.zeros(len(starts), dtype=np.intp)
+        starts[component[order]] = order  # the last write wins: the deepest agent of each component
 
 
 def _depths(links: np.ndarray, count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,14 +188,10 @@ def middles(count: int, links: np.ndarray) -> np.ndarray:
         count: N, the number of agents.
         links: (L, 2) pairs of agents.
     """
-    labels = _components(links, count)
-    starts, far = np.unique(labels, return_index=True)[1], np.zeros(count, dtype=np.int64)
-    for turn in range(3):
-        depth, order = _depths(links, count, starts)
+    labels, far = components(links, count), np.zeros(count, dtype=np.int64)
+    for turn, (depth, order) in enumerate(_sweeps(links, count, labels, 3)):
         if turn:
             far[order] = np.maximum(far[order], depth)
-        starts = np.zeros(len(starts), dtype=np.intp)
-        starts[labels[order]] = order  # the last write wins: the deepest agent of each component
     order = np.lexsort((np.arange(count), far, labels))
     return order[np.unique(labels[order], return_index=True)[1]]
 
@@ -215,9 +210,9 @@ def holders(team: Team, cluster: np.ndarray) -> np.ndarray:
         (C, 2) int32 pairs (holder, position), sorted, each once.
     """
     own = np.arange(team.count, dtype=np.int32)
-    pairs = _unique_pairs(np.concatenate([_reads(team), np.stack([own, own], axis=1)]), team.count)
+    pairs = unique_pairs(np.concatenate([task_pairs(team.families), np.stack([own, own], axis=1)]), team.count)
     further = list(_further(team, cluster, pairs))
-    return _unique_pairs(np.concatenate([pairs, *further]), team.count) if further else pairs
+    return unique_pairs(np.concatenate([pairs, *further]), team.count) if further else pairs
 
 
 def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.ndarray]:
@@ -227,8 +222,8 @@ def _further(team: Team, cluster: np.ndarray, pairs: np.ndarray) -> Iterator[np.
     """
     count, links = team.count, cluster_links(team, cluster)
     foreign = pairs[pairs[:, 0] != pairs[:, 1]]
-    known = _keys(links, count)  # sorted, as links are
-    wanted = _keys(np.stack([foreign.min(axis=1), foreign.max(axis=1)], axis=1), count)
+    known = pair_keys(links, count)  # sorted, as links are
+    wanted = pair_keys(np.stack([foreign.min(axis=1), foreign.max(axis=1)], axis=1), count)
     linked = np.append(known, -1)[np.searchsorted(known, wanted)] == wanted
     remote = np.unique(foreign[~linked, 1])
     if not len(remote):
@@ -276,16 +271,13 @@ def _steiner(root: int, wanted: set[int], neighbours: Sequence[np.ndarray]) -> s
     return added
 
 
-def _keys(pairs: np.ndarray, count: int) -> np.ndarray:
-    return pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+def components(edges: np.ndarray, count: int) -> np.ndarray:
+    """(N,) int32 label of the connected component of each agent, from 0; components are numbered by their first agent.
 
-
-def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    keys = distinct(_keys(pairs, count))
-    return np.stack([keys // count, keys % count], axis=1).astype(np.int32)
-
-
-def _components(edges: np.ndarray, count: int) -> np.ndarray:
+    Args:
+        edges: (E, 2) pairs of agents, in any order.
+        count: N, the number of agents.
+    """
     graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
     labels: np.ndarray = connected_components(graph, directed=False)[1]
     return labels.astype(np.int32)

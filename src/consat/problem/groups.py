@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from consat.errors import Fault, closest, shown
 from consat.problem.constraints.record import Constraint
-from consat.problem.parameters import LARGEST, Path, is_number
+from consat.problem.parameters import LARGEST, Path, is_number, is_printable, is_whole
 
 Ints = NDArray[np.int64]
 
@@ -142,9 +142,9 @@ def faults_of(group: Group, path: Path, dimension: int) -> list[Fault]:
     """The faults of a group, except those of its constraints."""
     where = label(group)
     wrong: list[tuple[str, str]] = []
-    if not isinstance(group.name, str) or not group.name.strip() or not group.name.isprintable():
+    if not is_printable(group.name):
         wrong.append(("group", f"group is {shown(group.name)}, but must be a printable text such as a, which gives a1, a2, …"))
-    if isinstance(group.count, bool) or not isinstance(group.count, int | np.integer) or not 1 <= group.count <= MOST:
+    if not is_whole(group.count, 1, MOST):
         wrong.append(("count", f"count is {shown(group.count)}, but must be a whole number from 1 to {MOST}"))
     if group.shape not in SHAPES:
         wrong.append(("shape", f"there is no shape {shown(group.shape)}; the shapes are {', '.join(SHAPES)}{closest(group.shape, SHAPES)}"))
@@ -152,7 +152,7 @@ def faults_of(group: Group, path: Path, dimension: int) -> list[Fault]:
     for key, value, low in distances:
         if (value is not None or key == "spacing") and not (is_number(value) and low <= value <= LARGEST):
             wrong.append((key, f"{key} is {shown(value)}, but must be a {'positive ' if low else ''}number{'' if low else ' ≥ 0'}"))
-    if isinstance(group.seed, bool) or not isinstance(group.seed, int | np.integer) or not 0 <= group.seed < 2**63:
+    if not is_whole(group.seed, 0, 2**63 - 1):
         wrong.append(("seed", f"seed is {shown(group.seed)}, but must be a whole number from 0 to 2^63 - 1"))
     if group.start is not None and not any(key == "count" for key, _ in wrong):
         start = np.asarray(group.start)

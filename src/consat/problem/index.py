@@ -7,9 +7,9 @@ from typing import Any
 
 from consat.errors import Fault, closest, shown
 from consat.problem.agent import Agent
-from consat.problem.family import Counted, Joined
 from consat.problem.groups import Group, faults_of, label
-from consat.problem.parameters import Path
+from consat.problem.names import Counted, Joined
+from consat.problem.parameters import Path, is_printable
 
 SUGGESTIONS = 20
 """With this many faults, errors stop suggesting similar ids and locating columns within expressions: in a large team that takes long."""
@@ -43,7 +43,7 @@ class Index:
                 continue
             self.singles.append((k, self.count, member))
             path: Path = ("agents", k, "id")
-            if not isinstance(member.id, str) or not member.id.strip() or not member.id.isprintable():
+            if not is_printable(member.id):
                 faults.append(Fault(path, f"id is {member.id!r}, but must be a printable text such as 'a1'", f"agents[{k}]"))
             elif member.id in numbers:
                 message = f"id {member.id!r} is taken by agents[{numbers[member.id]}]; every agent needs an id of its own"

@@ -1,4 +1,4 @@
-"""Communication links of a team, as given: pairs of agents, a graph, or the name of a topology."""
+"""Pairs of agents: the communication links of a team as given (pairs, a graph, or the name of a topology), and edges of the task graph."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from consat.errors import Fault, shown
-from consat.problem.family import Family, distinct
+from consat.numerics import distinct
+from consat.problem.family import Family
 from consat.problem.index import Index
 from consat.problem.parameters import Path
 
@@ -71,12 +72,34 @@ def _topology(kind: str, count: int, families: Sequence[Family]) -> np.ndarray:
         return np.stack([np.zeros(max(count - 1, 0), dtype=np.int32), i[1:]], axis=1)
     if kind == "complete":
         return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int32)
-    pairs = [np.stack([family.owner, family.agents[:, k]], axis=1) for family in families for k in range(family.arity)]
-    return np.concatenate([np.zeros((0, 2), dtype=np.int32), *pairs])
+    return task_pairs(families)
 
 
 def unique(pairs: np.ndarray, count: int) -> np.ndarray:
     """(L, 2) links, i < j, sorted, each once, without links from an agent to itself. `count`: N."""
-    low, high = pairs.min(axis=1), pairs.max(axis=1)
-    keys = distinct((low.astype(np.int64) * count + high)[low < high])
+    ends = np.sort(pairs, axis=1)
+    return unique_pairs(ends[ends[:, 0] < ends[:, 1]], count)
+
+
+def task_pairs(families: Iterable[Family]) -> np.ndarray:
+    """(E, 2) int32 pairs (owner, agent whose position it reads), one for each constraint and position, so pairs may repeat.
+
+    The owner itself is among them only for a constraint that reads nobody else.
+    """
+    edges = [np.zeros((0, 2), dtype=np.int32)]
+    for family in families:
+        for slot in range(family.arity):
+            pairs = np.stack([family.owner, family.agents[:, slot]], axis=1)
+            edges.append(pairs if family.arity == 1 else pairs[pairs[:, 0] != pairs[:, 1]])
+    return np.concatenate(edges)
+
+
+def pair_keys(pairs: np.ndarray, count: int) -> np.ndarray:
+    """(K,) distinct integers for distinct (K, 2) pairs of agents, in the order of the pairs. `count`: N, the number of agents."""
+    return pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+
+
+def unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """(K', 2) int32 pairs of agents, sorted, each once. `count`: N, the number of agents."""
+    keys = distinct(pair_keys(pairs, count))
     return np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1).astype(np.int32)

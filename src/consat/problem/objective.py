@@ -260,7 +260,7 @@ def margin_bounds(team: Team, smooth_margin: float, nu: Nu) -> tuple[float, floa
         nu: the smoothing of β.
     """
     sizes = team.constraints_per_agent
-    owners, most = max(int(np.count_nonzero(sizes)), 1), max([1, *sizes[sizes > 0].tolist()])
+    owners, most = max(int(np.count_nonzero(sizes)), 1), max(int(sizes.max()), 1)
     slack = math.log(owners) / float(nu.beta) + math.log(most) / float(nu.alpha)
     return smooth_margin, smooth_margin + slack
 

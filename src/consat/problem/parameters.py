@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -22,69 +22,89 @@ Moving: TypeAlias = "np.ndarray | Schedule"
 """A checked parameter: a constant array, or a schedule if it moves with time."""
 
 
-def checked(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Moving | None:
+class Spot(NamedTuple):
+    """Where a value stands in the input.
+
+    Attributes:
+        path: its place as keys and indices.
+        name: what messages call it: its key.
+        where: the agent and constraint in words.
+        faults: list to which its faults are added.
+    """
+
+    path: Path
+    name: str
+    where: str
+    faults: list[Fault]
+
+    def under(self, key: str) -> Spot:
+        """The spot of the value under a key of this one."""
+        return Spot((*self.path, key), key, self.where, self.faults)
+
+    def fault(self, message: str, *part: str | int) -> None:
+        """Add a fault of the value, or of a part of it. Returns None, so that a check can end with it."""
+        self.faults.append(Fault((*self.path, *part), message, self.where))
+
+
+def checked(parameter: Parameter, dimension: int, spot: Spot) -> Moving | None:
     """Check one parameter.
 
     Args:
         parameter: the value and what it must satisfy.
         dimension: d, the length of a vector.
-        path: place of the parameter in the input, for faults.
-        key: name of the parameter.
-        where: the agent and constraint in words, for faults.
-        faults: list to which faults are added.
+        spot: where it stands.
 
     Returns:
         the value as an array, or a schedule of arrays; None if it is not valid.
     """
     moves = isinstance(parameter.value, Schedule | Mapping)
-    value = (scheduled if moves else still)(parameter, dimension, path, key, where, faults)
+    value = (scheduled if moves else still)(parameter, dimension, spot)
     if value is not None and isinstance(parameter, Vector) and parameter.above is not None:
-        low = checked(Vector(parameter.above), dimension, (*path[:-1], "low"), "low", where, faults)
-        _require_above(value, low, path, key, where, faults)
+        low = checked(Vector(parameter.above), dimension, spot._replace(path=(*spot.path[:-1], "low"), name="low"))
+        if low is not None:
+            _require_above(value, low, spot)
     return value
 
 
-def _require_above(value: Moving, low: Moving | None, path: Path, key: str, where: str, faults: list[Fault]) -> None:
+def _require_above(value: Moving, low: Moving, spot: Spot) -> None:
     times = np.unique(np.concatenate([np.zeros(1), *(each.times for each in (value, low) if isinstance(each, Schedule))]))
-    for time in times.tolist() if low is not None else []:
+    for time in times.tolist():
         high, floor = (each.at(time) if isinstance(each, Schedule) else each for each in (value, low))
-        if high is not None and floor is not None and not np.all(high > floor):
+        if not np.all(high > floor):
             when = f" at {time:g} s" if len(times) > 1 else ""
-            message = f"{key} is {high.tolist()}{when}, but must be above low {floor.tolist()} on every axis"
-            faults.append(Fault(path, message, where))
+            spot.fault(f"{spot.name} is {high.tolist()}{when}, but must be above low {floor.tolist()} on every axis")
             return
 
 
-def scheduled(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> Schedule | None:
+def scheduled(parameter: Parameter, dimension: int, spot: Spot) -> Schedule | None:
     """A schedule of arrays, each value checked as a constant one is; None, and a fault, if it is not valid. Arguments as in `checked`."""
-    times, values = _schedule(parameter.value, path, key, where, faults)
+    times, values = _schedule(parameter.value, spot)
     if times is None or values is None:
         return None
-    known = len(faults)
+    known = len(spot.faults)
     each = [
-        still(dataclasses.replace(parameter, value=value), dimension, (*path, "values", k), key, where, faults)
+        still(dataclasses.replace(parameter, value=value), dimension, spot._replace(path=(*spot.path, "values", k)))
         for k, value in enumerate(values)
     ]
-    if len(faults) > known:
+    if len(spot.faults) > known:
         return None
     found = [value for value in each if value is not None]
     if any(value.shape != found[0].shape for value in found):
-        faults.append(Fault((*path, "values"), f"the values of {key} must have one shape throughout", where))
-        return None
+        return spot.fault(f"the values of {spot.name} must have one shape throughout", "values")
     made = Schedule(np.array(times, dtype=float), np.stack(found))
     if isinstance(parameter, Vector) and parameter.nonzero and (k := _through_zero(made.values)) is not None:
-        message = f"{key} passes through zero between {times[k]:g} s and {times[k + 1]:g} s, but must point somewhere at all times"
-        faults.append(Fault((*path, "values", k + 1), message, where))
-        return None
+        when = f"between {times[k]:g} s and {times[k + 1]:g} s"
+        return spot.fault(f"{spot.name} passes through zero {when}, but must point somewhere at all times", "values", k + 1)
     return made
 
 
-def _schedule(value: Any, path: Path, key: str, where: str, faults: list[Fault]) -> tuple[list[float] | None, list[Any] | None]:
+def _schedule(value: Any, spot: Spot) -> tuple[list[float] | None, list[Any] | None]:
     """The times and values of a schedule: lists of equal length, with increasing finite times. (None, None), and a fault, otherwise."""
+    key = spot.name
     example = f"{key}: {{times: [0, 10], values: [.., ..]}}"
 
     def wrong(message: str, *at: str | int) -> tuple[None, None]:
-        faults.append(Fault((*path, *at), message, where))
+        spot.fault(message, *at)
         return None, None
 
     if isinstance(value, Mapping):
@@ -120,32 +140,28 @@ def _through_zero(values: np.ndarray) -> int | None:
     return int(bad[0]) if len(bad) else None
 
 
-def still(parameter: Parameter, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
+def still(parameter: Parameter, dimension: int, spot: Spot) -> np.ndarray | None:
     """The value of a constant parameter as an array; None, and a fault, if it is not valid. Arguments as in `checked`."""
     if isinstance(parameter, Fixed):
         try:
             return np.asarray(parameter.value, dtype=float)
         except (TypeError, ValueError, OverflowError):
-            faults.append(Fault(path, f"{key} must be a number or an array of numbers, but is {parameter.value!r}", where))
-            return None
+            return spot.fault(f"{spot.name} must be a number or an array of numbers, but is {parameter.value!r}")
     if isinstance(parameter, Number):
-        return number(parameter, path, key, where, faults)
-    value = vector(parameter.value, dimension, path, key, where, faults)
+        return number(parameter, spot)
+    value = vector(parameter.value, dimension, spot)
     if value is not None and parameter.nonzero and not np.any(value):
-        faults.append(Fault(path, f"{key} is zero, but must point somewhere", where))
+        return spot.fault(f"{spot.name} is zero, but must point somewhere")
     return value
 
 
-def checked_rows(parameter: Parameter, size: tuple[int, int], path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
+def checked_rows(parameter: Parameter, size: tuple[int, int], spot: Spot) -> np.ndarray | None:
     """Check an array with one value per constraint.
 
     Args:
         parameter: the array and what each value must satisfy.
         size: (M, d), the number of constraints and the dimension.
-        path: as in `checked`.
-        key: as in `checked`.
-        where: as in `checked`.
-        faults: as in `checked`.
+        spot: where it stands.
 
     Returns:
         (M,) numbers or (M, d) vectors as floats; None, and a fault, if they are not valid.
@@ -167,8 +183,7 @@ def checked_rows(parameter: Parameter, size: tuple[int, int], path: Path, key: s
         message = "must be above low on every axis, throughout"
     if message is None:
         return value.astype(float)
-    faults.append(Fault(path, f"{key} {message}", where))
-    return None
+    return spot.fault(f"{spot.name} {message}")
 
 
 def is_number(value: Any) -> bool:
@@ -176,35 +191,41 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def number(parameter: Number, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
+def is_whole(value: Any, low: int, high: int) -> bool:
+    """Whether `value` is an integer from `low` to `high`. Booleans are not."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
+
+
+def is_printable(value: Any) -> bool:
+    """Whether `value` is a text that can be shown: an id or a name."""
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
+def number(parameter: Number, spot: Spot) -> np.ndarray | None:
     """The value of a scalar parameter as an array of shape (); None, and a fault, if it is not valid."""
     value = parameter.value
     want = "a positive number" if parameter.positive else "a number"
     if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
         value = value.item()
     if not is_number(value) or not abs(value) <= LARGEST:
-        faults.append(Fault(path, f"{key} is {shown(value)}, but must be {want}{_limit(value)}", where))
-        return None
+        return spot.fault(f"{spot.name} is {shown(value)}, but must be {want}{_limit(value)}")
     if parameter.positive and value < 1 / LARGEST:
-        faults.append(Fault(path, f"{key} is {value!r}, but must be {want}", where))
-        return None
+        return spot.fault(f"{spot.name} is {value!r}, but must be {want}")
     return np.asarray(float(value))
 
 
-def vector(value: Any, dimension: int, path: Path, key: str, where: str, faults: list[Fault]) -> np.ndarray | None:
+def vector(value: Any, dimension: int, spot: Spot) -> np.ndarray | None:
     """A vector as a (dimension,) array; None, and a fault, if it is not valid. `dimension` 0 means unknown: any length is accepted."""
     entries = value.tolist() if isinstance(value, np.ndarray | jax.Array) else value
     numbers = f"{dimension} number" + ("s" if dimension > 1 else "")
     if not isinstance(entries, list | tuple):
-        faults.append(Fault(path, f"{key} is {shown(value)}, but must be a list of {numbers}", where))
-    elif dimension and len(entries) != dimension:
-        message = f"{key} has {counted(len(entries), 'entry', 'entries')}, but must have {dimension}, one for each dimension of the team"
-        faults.append(Fault(path, message, where))
-    elif bad := [entry for entry in entries if not is_number(entry) or not abs(entry) <= LARGEST]:
-        faults.append(Fault(path, f"{key} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}", where))
-    else:
-        return np.array(entries, dtype=float)
-    return None
+        return spot.fault(f"{spot.name} is {shown(value)}, but must be a list of {numbers}")
+    if dimension and len(entries) != dimension:
+        has = counted(len(entries), "entry", "entries")
+        return spot.fault(f"{spot.name} has {has}, but must have {dimension}, one for each dimension of the team")
+    if bad := [entry for entry in entries if not is_number(entry) or not abs(entry) <= LARGEST]:
+        return spot.fault(f"{spot.name} holds {shown(bad[0])}, but must be a list of {numbers}{_limit(bad[0])}")
+    return np.array(entries, dtype=float)
 
 
 def _limit(value: Any) -> str:

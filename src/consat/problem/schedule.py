@@ -84,17 +84,17 @@ class Track(NamedTuple):
         low, high = values[row, k], values[row, after]
         return low + part.reshape(-1, *[1] * (low.ndim - 1)) * (high - low)
 
-    def joined(self, more: Sequence[tuple[Track, int]]) -> Track:
-        """This track joined with others.
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Track, int]]) -> Track:
+        """Several tracks as one.
 
         Args:
-            more: pairs of a track and the offset to add to its rows.
+            parts: pairs of a track and the offset to add to its rows.
         """
-        tracks = [self, *(track for track, _ in more)]
-        most = max(track.times.shape[1] for track in tracks)
-        padded = [_padded(track.times, track.values, most) for track in tracks]
-        rows = np.concatenate([self.rows, *(track.rows + np.int32(offset) for track, offset in more)])
-        return Track(rows, *(np.concatenate(column) for column in zip(*padded, strict=True)))
+        most = max(track.times.shape[1] for track, _ in parts)
+        padded = [_padded(track.times, track.values, most) for track, _ in parts]
+        rows = np.concatenate([track.rows + np.int32(offset) for track, offset in parts])
+        return cls(rows, *(np.concatenate(column) for column in zip(*padded, strict=True)))
 
     def chosen(self, rows: np.ndarray) -> Track | None:
         """The track of a subset of the constraints, renumbered from 0; None if none of them moves.
@@ -102,11 +102,10 @@ class Track(NamedTuple):
         Args:
             rows: (M',) ascending indices of the constraints to keep.
         """
-        where = np.searchsorted(rows, self.rows)
-        inside = (where < len(rows)) & (rows[np.minimum(where, len(rows) - 1)] == self.rows) if len(rows) else np.zeros(0, dtype=bool)
-        if not np.any(inside):
+        kept = np.isin(self.rows, rows)
+        if not kept.any():
             return None
-        return Track(where[inside].astype(np.int32), self.times[inside], self.values[inside])
+        return Track(np.searchsorted(rows, self.rows[kept]).astype(np.int32), self.times[kept], self.values[kept])
 
     @property
     def knots(self) -> np.ndarray:
@@ -121,12 +120,6 @@ class Track(NamedTuple):
         times, values = self.times[place], self.values[place]
         kept = np.concatenate([[True], np.isfinite(times[1:])])
         return Schedule(times[kept], values[kept])
-
-
-def chosen(tracks: Mapping[str, Track], rows: np.ndarray) -> dict[str, Track]:
-    """The tracks of a subset of the constraints, by parameter name; see `Track.chosen`."""
-    kept = ((key, track.chosen(rows)) for key, track in tracks.items())
-    return {key: track for key, track in kept if track is not None}
 
 
 def _padded(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import cast
@@ -12,13 +13,14 @@ import numpy as np
 from consat.errors import Fault, InvalidTeam, shown
 from consat.problem.agent import Agent
 from consat.problem.constraints.record import OWNER, Constraint, Fixed
-from consat.problem.entries import Entry, alike, entries_of, trace
+from consat.problem.entries import alike, entries_of, trace
 from consat.problem.expansion import Expansion
-from consat.problem.family import Chosen, Family, FamilyPart, assemble
+from consat.problem.family import Family, assemble
 from consat.problem.groups import Group
 from consat.problem.index import Index, who_is
 from consat.problem.links import Links, pairs_of, topology, unique
-from consat.problem.parameters import Path, vector
+from consat.problem.names import Chosen
+from consat.problem.parameters import Path, Spot, is_printable, is_whole, vector
 from consat.problem.schedule import FOREVER
 
 MOST_NAMED = 100_000
@@ -71,12 +73,12 @@ class Team:
     def __init__(self, agents: Iterable[Agent | Group], links: Links = "task", dimension: int = 2, *, unit: str | None = None) -> None:
         self.members = tuple(agents)
         faults: list[Fault] = []
-        if isinstance(dimension, bool) or not isinstance(dimension, int | np.integer) or not 1 <= dimension <= 64:
+        if not is_whole(dimension, 1, 64):
             faults.append(Fault(("dimension",), f"dimension is {dimension!r}, but must be a whole number from 1 to 64", "dimension"))
             dimension = 0
         if not self.members:
             faults.append(Fault(("agents",), "a team needs at least one agent", "agents"))
-        if unit is not None and not (isinstance(unit, str) and unit.strip() and unit.isprintable() and len(unit) <= LONGEST_UNIT):
+        if unit is not None and not (is_printable(unit) and len(unit) <= LONGEST_UNIT):
             what = f"unit is {shown(unit)}, but must be a printable text of at most {LONGEST_UNIT} letters, such as m"
             faults.append(Fault(("unit",), what, "unit"))
         self.unit = unit
@@ -91,7 +93,7 @@ class Team:
             trace(entries, self.dimension, faults)
             for k, i, agent in index.singles:
                 if agent.start is not None:
-                    start = vector(agent.start, self.dimension, ("agents", k, "start"), "start", who_is(k, agent.id), faults)
+                    start = vector(agent.start, self.dimension, Spot(("agents", k, "start"), "start", who_is(k, agent.id), faults))
                     self.starts[i] = np.nan if start is None else start
             for k, i, group in index.groups:
                 parts += self._expand(group, i, index, ("agents", k), faults)
@@ -104,8 +106,8 @@ class Team:
             self.names = tuple(self.names)
         self.links = unique(pairs, self.count) if pairs is not None else topology(cast(str, links), self.count, self.families)
 
-    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[FamilyPart]:
-        expansion = Expansion(group, first, index.ids, index.get, self.dimension, path, faults)
+    def _expand(self, group: Group, first: int, index: Index, path: Path, faults: list[Fault]) -> list[tuple[Family, Sequence[str]]]:
+        expansion = Expansion(group, first, index, self.dimension, path, faults)
         mine = slice(first, first + group.count)
         if group.start is not None:
             self.starts[mine] = group.start
@@ -113,14 +115,7 @@ class Team:
             if self.around is None:
                 self.around = np.full_like(self.starts, np.nan), np.full(len(self.starts), np.nan)
             self.around[0][mine], self.around[1][mine] = expansion.layout.places, group.scatter
-        made = expansion.parts()
-        entries = [
-            Entry(constraint, first, tuple(range(part.agents.shape[1])), "", at, where, {k: v[0] for k, v in part.parameters.items()})
-            for part, constraint, at, where in made
-            if len(part.owner)
-        ]
-        trace(entries, self.dimension, faults)
-        return [part for part, *_ in made if len(part.owner)]
+        return expansion.parts()
 
     def _copied(self) -> Team:
         """A copy without what was computed of the constraints and agents, which are to be replaced."""
@@ -206,30 +201,18 @@ class Team:
         """
         place = np.full(self.count, -1, dtype=np.int32)
         place[agents] = np.arange(len(agents), dtype=np.int32)
-        parts, numbers = [], [np.zeros(0, dtype=np.int32)]
-        for family in self.families:
-            kept = family.members((place[family.agents] >= 0).all(axis=1))
-            numbers.append(kept.number)
-            parts.append(
-                FamilyPart(
-                    kind=family.kind,
-                    psi=family.psi,
-                    agents=place[kept.agents],
-                    owner=place[kept.owner],
-                    parameters=kept.parameters,
-                    weight=kept.weight,
-                    names=Chosen(self.names, kept.number),
-                    sources=kept.sources,
-                    turn=kept.number,
-                    tracks=kept.tracks,
-                )
-            )
+        kept = [family.members((place[family.agents] >= 0).all(axis=1)) for family in self.families]
+        parts = [
+            (dataclasses.replace(each, agents=place[each.agents], owner=place[each.owner]), Chosen(self.names, each.number))
+            for each in kept
+            if each.size
+        ]
         team = self._copied()
         team.ids, team.starts, team.members, team.around = Chosen(self.ids, agents), self.starts[agents], None, None
-        team.families, team.owner, team.names = assemble([part for part in parts if len(part.owner)])
+        team.families, team.owner, team.names = assemble(parts)
         links = place[self.links]
         team.links = links[(links >= 0).all(axis=1)]
-        return team, np.sort(np.concatenate(numbers))
+        return team, np.sort(np.concatenate([np.zeros(0, dtype=np.int32), *(each.number for each in kept)]))
 
     @property
     def count(self) -> int:

@@ -102,9 +102,7 @@ def scale(team: Team) -> Scale:
     Cached by team.
     """
     measured = [_measure(family, team.dimension) for each in team.instants for family in each.families]
-    psi = np.concatenate([np.zeros(0), *(m[0] for m in measured)])
-    bend = np.concatenate([np.zeros(0), *(m[1] for m in measured)])
-    slope = np.concatenate([np.zeros(0), *(m[2] for m in measured)])
+    psi, bend, slope = (np.concatenate([np.zeros(0), *(m[k] for m in measured)]) for k in range(3))
     centers = np.concatenate([np.zeros((0, team.dimension)), *(m[3] for m in measured)])
     curved = np.isfinite(psi) & (psi > 0) & (bend > 0)
     length = float(np.median(np.sqrt(2 * psi[curved] / bend[curved]))) if curved.any() else 1.0

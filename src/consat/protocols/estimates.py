@@ -16,8 +16,7 @@ import numpy as np
 from jax import Array
 
 from consat.errors import InvalidSettings
-from consat.numerics import Groups, on_device, pick
-from consat.problem.family import distinct
+from consat.numerics import Groups, distinct, on_device, pick
 from consat.problem.graphs import clusters, holders, relays, require_connected
 from consat.problem.team import Team
 from consat.settings import Layout

@@ -24,7 +24,7 @@ from consat.numerics import float64
 from consat.problem import structure
 from consat.problem.agent import Agent
 from consat.problem.changes import changed, changes_of, is_adjustment, is_structural, place_of
-from consat.problem.parameters import vector
+from consat.problem.parameters import Spot, vector
 from consat.problem.team import Team
 from consat.protocols import FLOWS, ROUNDS
 from consat.results.result import Result
@@ -225,7 +225,7 @@ class Session:
         """
         i = self._place_of(agent)
         faults: list[Fault] = []
-        value = vector(position, self.dimension, ("position",), "position", f"agent {agent!r}", faults)
+        value = vector(position, self.dimension, Spot(("position",), "position", f"agent {agent!r}", faults))
         if value is None:
             raise InvalidTeam(faults)
         self._running.place(i, value)

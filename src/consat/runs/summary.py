@@ -10,6 +10,7 @@ import numpy as np
 from consat import __version__
 from consat.certify.certificate import bounds
 from consat.numerics import number, on_device
+from consat.problem.graphs import members
 from consat.problem.objective import Objective, SmoothingSchedule, weigh
 from consat.problem.team import Team
 from consat.problem.units import Scale
@@ -79,7 +80,7 @@ def summarise(
         "bytes": trace.bytes,
         "positions": {agent: [number(x) for x in row] for agent, row in zip(team.ids, position, strict=True)} if listed else None,
         "agents": _agents(team, margins, multipliers, trace.violated) if listed else None,
-        "clusters": _clusters(team, trace.cluster) if listed else None,
+        "clusters": members(team, trace.cluster) if listed else None,
         "motion": trace.motion,
         "verdicts": _verdicts(whole, trace, since) if whole.moves else None,
         "on_the_way": None if trace.violated is None else _on_the_way(team, trace.violated),
@@ -151,10 +152,3 @@ def _on_the_way(team: Team, violated: np.ndarray) -> Mapping[str, Any]:
         k = int(np.nanargmax(violated))
         worst = {"agent": team.ids[team.owner[k]], "constraint": team.names[k], "violated_share": float(violated[k])}
     return {"watched": watched, "violated": ever, "worst": worst}
-
-
-def _clusters(team: Team, cluster: np.ndarray) -> list[list[str]]:
-    members: list[list[str]] = [[] for _ in range(int(cluster.max(initial=-1)) + 1)]
-    for agent, label in zip(team.ids, cluster, strict=True):
-        members[label].append(agent)
-    return members

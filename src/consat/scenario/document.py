@@ -24,7 +24,7 @@ from ruamel.yaml.events import (
     ScalarEvent,
 )
 
-from consat.errors import AT_KEY, Fault, InvalidInput, InvalidScenario, Place, shown
+from consat.errors import AT_KEY, Fault, InvalidScenario, Place, shown
 
 LARGEST: Final = 16 * 2**20
 """Largest size of a file, bytes."""
@@ -125,11 +125,6 @@ class Document:
         """An error for a file that cannot be read any further; includes the faults found so far."""
         self.faults.append(Fault((), message, "YAML", place=place))
         return self.invalid()
-
-
-def locate(error: InvalidInput, document: Document) -> InvalidScenario:
-    """The error with the places of its faults in the document."""
-    return error if isinstance(error, InvalidScenario) else Document(document.file, document.root).invalid(error.faults)
 
 
 def decode(content: bytes, file: str) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from consat.errors import Fault, InvalidInput, InvalidScenario, closest
 from consat.problem.team import Team
-from consat.scenario.document import LARGEST, Document, decode, locate, read
+from consat.scenario.document import LARGEST, Document, decode, read
 from consat.scenario.overrides import override
 from consat.scenario.schema import build
 from consat.scenario.writing import write
@@ -86,7 +86,10 @@ def loads(text: str, name: str = "scenario", overrides: Sequence[str] = ()) -> S
 
 def located(error: InvalidInput, scenario: Scenario) -> InvalidScenario:
     """The error with the places of its faults in the scenario's file. For errors found after loading, such as a disconnected cluster."""
-    return locate(error, scenario.document) if scenario.document else InvalidScenario(error.faults)
+    if isinstance(error, InvalidScenario):
+        return error
+    document = scenario.document
+    return InvalidScenario(error.faults) if document is None else Document(document.file, document.root).invalid(error.faults)
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from consat.problem.groups import ACROSS, MOST, PLACE, SHAPES, Group
 from consat.problem.links import TOPOLOGIES
 from consat.problem.schedule import KEYS as SCHEDULE_KEYS
 from consat.problem.team import LONGEST_UNIT
-from consat.scenario.mappings import TEXT
+from consat.scenario.mappings import TEXT, parameters, required
 from consat.scenario.schema import AGENT_KEYS, GROUP_KEYS, KEYS, MEMBER_KEYS, VERSION
 from consat.settings import Settings
 
@@ -129,17 +129,15 @@ def _schedule() -> Json:
 
 def _constraint(kind: str, factory: Callable[..., Any], *, grouped: bool = False) -> Json:
     """A kind of constraint; of a group also who has it, and whom it reads."""
-    parameters = inspect.signature(factory).parameters
-    properties = {"kind": {"const": kind}} | {name: _parameter(name, each, grouped=grouped) for name, each in parameters.items()}
+    properties = {"kind": {"const": kind}} | {name: _parameter(name, each, grouped=grouped) for name, each in parameters(factory).items()}
     about = _arguments(factory)
     if grouped:
         properties |= {"of": _whose(), "agent": _relation()}
         about |= {"of": "who has it; left out, every member", "agent": "whom it reads: an id, or a step such as -1 for the one ahead"}
-    keys = ["kind", *parameters]
+    keys = ["kind", *parameters(factory)]
     if grouped:
         keys += [key for key in (MEMBER_KEYS if kind == "expr" else MEMBER_KEYS[:1]) if key not in keys]
-    needed = [name for name, each in parameters.items() if each.default is each.empty]
-    return {"description": _first(factory)} | _object(properties, keys, ["kind", *needed], about)
+    return {"description": _first(factory)} | _object(properties, keys, ["kind", *required(factory)], about)
 
 
 def _parameter(name: str, parameter: inspect.Parameter, *, grouped: bool) -> Json:
@@ -154,31 +152,31 @@ def _parameter(name: str, parameter: inspect.Parameter, *, grouped: bool) -> Jso
 
 
 def _whose() -> Json:
-    every = {"type": "object", "properties": {"every": COUNT}, "required": ["every"], "additionalProperties": False}
-    return {"anyOf": [TEXTUAL, every, {"type": "array", "items": TEXTUAL}]}
+    return {"anyOf": [TEXTUAL, _only("every"), {"type": "array", "items": TEXTUAL}]}
 
 
 def _relation() -> Json:
-    nearest = {"type": "object", "properties": {"nearest": COUNT}, "required": ["nearest"], "additionalProperties": False}
-    return {"anyOf": [TEXTUAL, {"type": "integer"}, {"type": "array", "items": {"type": "integer"}}, nearest]}
+    return {"anyOf": [TEXTUAL, {"type": "integer"}, {"type": "array", "items": {"type": "integer"}}, _only("nearest")]}
+
+
+def _only(key: str) -> Json:
+    """A mapping with this one key, a count."""
+    return _object({key: COUNT}, (key,), (key,), {})
 
 
 def _made(kind: str, factory: Callable[..., Any], *, kind_needed: bool = True) -> Json:
     """A robot or an obstacle: numbers, or lists of them."""
-    parameters = inspect.signature(factory).parameters
     shapes: Mapping[str, Json] = {
         "Number": {"anyOf": [POSITIVE, NUMBERS]},
         "float": POSITIVE,
         "Sequence[float]": NUMBERS,
         "Sequence[Sequence[float]]": {"type": "array", "items": NUMBERS, "minItems": 3},
     }
-    properties = {"kind": {"const": kind}} | {name: shapes[str(each.annotation)] for name, each in parameters.items()}
-    needed = [name for name, each in parameters.items() if each.default is each.empty]
-    for name, each in parameters.items():
-        if each.default is not each.empty:
-            properties[name] = properties[name] | {"default": each.default}
-    required = ["kind", *needed] if kind_needed else []
-    return {"description": _first(factory)} | _object(properties, ["kind", *parameters], required, _arguments(factory))
+    properties: dict[str, Json] = {"kind": {"const": kind}}
+    for name, each in parameters(factory).items():
+        properties[name] = shapes[str(each.annotation)] | ({} if each.default is each.empty else {"default": each.default})
+    needed = ["kind", *required(factory)] if kind_needed else []
+    return {"description": _first(factory)} | _object(properties, list(properties), needed, _arguments(factory))
 
 
 def _first(factory: Callable[..., Any]) -> str:

@@ -118,13 +118,16 @@ def kind_of(model: Model[Any]) -> str:
 
 def model_data(model: Model[Any]) -> dict[str, Any]:
     """A model as plain data of a scenario file."""
-    return {"kind": kind_of(model)} | {each.name: _listed(getattr(model, each.name)) for each in dataclasses.fields(model)}  # type: ignore[arg-type]
+    return _data(kind_of(model), model)
 
 
 def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
     """An obstacle as plain data of a scenario file."""
-    plain = {each.name: getattr(obstacle, each.name) for each in dataclasses.fields(obstacle)}
-    return {"kind": type(obstacle).__name__.lower()} | {key: _listed(value) for key, value in plain.items()}
+    return _data(type(obstacle).__name__.lower(), obstacle)
+
+
+def _data(kind: str, made: Any) -> dict[str, Any]:
+    return {"kind": kind} | {each.name: _listed(getattr(made, each.name)) for each in dataclasses.fields(made)}
 
 
 def _listed(value: Any) -> Any:
@@ -147,9 +150,9 @@ def model_of(data: Any, where: str = "robots", base: Mapping[str, Any] | None = 
     return _made(data, KINDS, where, "{kind: unicycle, radius: 0.1}", base)
 
 
-def obstacle_of(data: Any, where: str = "obstacle") -> Obstacle:
+def obstacle_of(data: Any) -> Obstacle:
     """An obstacle from a mapping of a scenario file; raises as `model_of`."""
-    made: Obstacle = _made(data, SHAPES, where, "{kind: disc, center: [0, 0], radius: 1}", None)
+    made: Obstacle = _made(data, SHAPES, "obstacle", "{kind: disc, center: [0, 0], radius: 1}", None)
     return made
 
 

@@ -15,8 +15,9 @@ from consat.errors import AT_KEY, Fault, InvalidInput, InvalidTeam, counted, sho
 from consat.problem.agent import Agent
 from consat.problem.constraints import KINDS
 from consat.problem.groups import MOST, Each, Group
+from consat.problem.index import who_is
 from consat.problem.links import Links
-from consat.problem.parameters import LARGEST, is_number
+from consat.problem.parameters import LARGEST, is_number, is_printable
 from consat.problem.team import Team
 from consat.scenario.document import Document, Path
 from consat.scenario.mappings import constraint
@@ -92,7 +93,7 @@ def build(document: Document) -> Built:
     _version(data, faults, document)
     data = faults.keys((), data, KEYS)
     name = data.get("name")
-    if name is not None and not (isinstance(name, str) and name.strip() and name.isprintable()):
+    if name is not None and not is_printable(name):
         faults.add(("name",), f"name is {shown(name)}, but must be a printable text; put numbers in quotes")
     dimension = data.get("dimension", 2)
     settings = _settings({key: data[key] for key in SETTINGS if key in data}, dimension, faults)
@@ -123,13 +124,12 @@ def _rate(data: Any, faults: _Faults) -> float | None:
 def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots | None:
     """The robots and obstacles; None if there are no robots, or if they have faults."""
     agents = data.get("agents")
-    if not any(key in data for key in ("robots", "obstacles")) and not _any_robot(agents):
+    entries = enumerate(agents if isinstance(agents, list) else [])
+    own = [(i, entry) for i, entry in entries if isinstance(entry, dict) and entry.get("robot")]
+    if not own and "robots" not in data and "obstacles" not in data:
         return None
     from consat.scenario.robots import Robots, kind_of, model_of
 
-    own = [
-        (i, entry) for i, entry in enumerate(agents if isinstance(agents, list) else []) if isinstance(entry, dict) and entry.get("robot")
-    ]
     common, known = data.get("robots"), len(faults.found)
     made = _obstacles(data.get("obstacles"), dimension, faults)
     if common is None and not own:
@@ -140,13 +140,12 @@ def _robots(data: Mapping[str, Any], dimension: Any, faults: _Faults) -> Robots 
     whole = _made(functools.partial(model_of, base), ("robots",), "robots", faults)
     if whole is None:  # a fault of the common description is reported once, not for each agent
         return None
-    each_own = {
-        str(entry.get("id")): model
-        for i, entry in own
-        if (model := _made(
-            functools.partial(model_of, entry["robot"], f"agent {entry.get('id')!r}, robot", base), ("agents", i, "robot"), "", faults
-        )) is not None
-    }  # fmt: skip
+    each_own = {}
+    for i, entry in own:
+        make = functools.partial(model_of, entry["robot"], f"agent {entry.get('id')!r}, robot", base)
+        model = _made(make, ("agents", i, "robot"), "", faults)
+        if model is not None:
+            each_own[str(entry.get("id"))] = model
     if len(faults.found) > known:
         return None
     for model, path in ((whole, ("robots", "kind")), *((each, ("robots",)) for each in each_own.values())):
@@ -174,10 +173,6 @@ def _obstacles(data: Any, dimension: Any, faults: _Faults) -> list[Obstacle]:
             message = f"it lies in {each.dimension} dimensions, but the team has {dimension}"
             faults.add(("obstacles", k), message, f"obstacles[{k}]")
     return made
-
-
-def _any_robot(agents: Any) -> bool:
-    return isinstance(agents, list) and any(isinstance(entry, dict) and entry.get("robot") for entry in agents)
 
 
 def _made(make: Callable[[], Any], path: Path, where: str, faults: _Faults) -> Any:
@@ -278,7 +273,7 @@ def _agent(data: Any, path: Path, faults: _Faults) -> Agent:
     if "id" not in data:
         faults.add((*path, "id"), "id is missing; every agent needs one, such as a1", where)
     name = data.get("id", "")
-    where = f"agent {name!r}" if isinstance(name, str) and name.strip() else where
+    where = who_is(int(path[-1]), name)
     made = [_constraint(item, at, where, faults) for at, item in _constraints(data, path, where, faults)]
     return Agent(name, made, data.get("start"))
 

@@ -6,7 +6,6 @@ Short values are written in the style of JSON, which is part of YAML 1.2. The la
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -16,12 +15,14 @@ import numpy as np
 
 from consat.errors import Fault, InvalidTeam
 from consat.problem.constraints import KINDS, OWNER, Constraint, box
+from consat.problem.constraints.record import flatten
 from consat.problem.family import Family
 from consat.problem.groups import Each, Group
 from consat.problem.links import TOPOLOGIES, topology
 from consat.problem.schedule import Schedule
 from consat.problem.team import Team
 from consat.scenario.document import resolve
+from consat.scenario.mappings import required
 from consat.scenario.schema import GROUP_KEYS, SETTINGS, VERSION
 from consat.settings import Settings
 
@@ -78,17 +79,13 @@ def dump(
 
 def _agents(team: Team) -> Iterator[dict[str, Any]]:
     """The entries of the agents that are not members of a group."""
-    grouped = np.zeros(team.count, dtype=bool)
-    first = 0
-    for member in team.members or ():
-        if isinstance(member, Group):
-            grouped[first : first + member.count] = True
-        first += member.count if isinstance(member, Group) else 1
-    alone = np.flatnonzero(~grouped)
-    owned: dict[int, dict[int, dict[str, Any]]] = {i: {} for i in alone.tolist()}
+    members = team.ids if team.members is None else team.members
+    grouped = [isinstance(member, Group) for member in members]
+    alone = ~np.repeat(grouped, [member.count if isinstance(member, Group) else 1 for member in members])
+    owned: dict[int, dict[int, dict[str, Any]]] = {i: {} for i in np.flatnonzero(alone).tolist()}
     faults = []
     for family in team.families:
-        chosen = np.flatnonzero(~grouped[family.owner])
+        chosen = np.flatnonzero(alone[family.owner])
         for k, entry in zip(chosen.tolist(), _constraints(team, family, chosen), strict=True):
             owned[int(family.owner[k])][int(family.number[k])] = entry
     for owner, constraints in owned.items():
@@ -143,18 +140,31 @@ def _each(constraint: Constraint, outer: Each) -> dict[str, Any] | None:
     arrays = [outer.of, outer.agent, *constraint.reads, *(values.values() if constraint.psi not in _SIDES else ())]
     if any(isinstance(value, np.ndarray) for value in arrays):
         return None
-    if constraint.source is not None:
-        entry: dict[str, Any] = {"kind": "expr", "psi": constraint.source} | ({} if outer.agent is None else {"agent": outer.agent})
-    elif constraint.psi in _SIDES:
-        entry = _side(constraint.psi, values)
-    elif constraint.psi in _KIND_OF:
-        entry = {"kind": _KIND_OF[constraint.psi]} | dict.fromkeys(["agent"] * (len(constraint.reads) - 1), constraint.reads[-1]) | values
-    else:
+    other = outer.agent if constraint.source is not None else constraint.reads[1] if len(constraint.reads) > 1 else None
+    entry = _described(constraint.psi, constraint.source, other, values)
+    if entry is None:
         return None
     named = {} if constraint.name is None else {"name": constraint.name}
     weight = {} if constraint.weight == 1 else {"weight": float(constraint.weight)}
     plain = {key: list(value) if isinstance(value, tuple) else value for key, value in (entry | named | weight).items()}
     return plain | ({} if outer.of is None else {"of": outer.of})
+
+
+def _described(psi: Callable[..., Any], source: str | None, agent: Any, values: dict[str, Any]) -> dict[str, Any] | None:
+    """What a file says of a function ψ; None if a file cannot hold it.
+
+    Args:
+        psi: the function.
+        source: its text, if it is a text expression.
+        agent: what stands under ``agent``; None if nothing does.
+        values: plain values of the parameters of a library function.
+    """
+    other = {} if agent is None else {"agent": agent}
+    if source is not None:
+        return {"kind": "expr", "psi": source} | other
+    if psi in _SIDES:
+        return _side(psi, values)
+    return {"kind": _KIND_OF[psi]} | other | values if psi in _KIND_OF else None
 
 
 def _side(psi: Callable[..., Any], parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,13 +194,9 @@ def _constraints(team: Team, family: Family, chosen: np.ndarray) -> Iterator[dic
         moving = {key: track.schedule(k) for key, track in family.tracks.items()}
         parameters |= {key: schedule.plain() for key, schedule in moving.items() if schedule is not None}
         reads = [team.ids[i] for i in family.agents[k]]
-        entry: dict[str, Any] = {}
-        if family.sources is not None:
-            entry = {"kind": "expr", "psi": family.sources[k]}
-        elif family.psi in _SIDES:
-            entry = _side(family.psi, parameters)
-        elif family.psi in _KIND_OF:
-            entry = {"kind": _KIND_OF[family.psi]} | ({"agent": reads[1]} if len(reads) > 1 else {}) | parameters
+        source = None if family.sources is None else family.sources[k]
+        other = reads[1] if len(reads) > 1 and source is None else None
+        entry = _described(family.psi, source, other, parameters) or {}
         others = [agent for agent, i in zip(reads, family.agents[k], strict=True) if i != family.owner[k]]
         derived = f"{entry.get('kind')}({', '.join(others)})" if others else entry.get("kind")
         if team.names[number] != derived:
@@ -200,16 +206,12 @@ def _constraints(team: Team, family: Family, chosen: np.ndarray) -> Iterator[dic
         yield entry
 
 
-def _kinds() -> Iterator[tuple[Callable[..., Any], str]]:
-    for kind, factory in KINDS.items():
-        if kind not in ("box", "expr"):
-            required = [key for key, each in inspect.signature(factory).parameters.items() if each.default is each.empty]
-            probe = factory(**dict.fromkeys(required, OWNER))
-            if isinstance(probe, Constraint):
-                yield probe.psi, kind
-
-
-_KIND_OF: Final = dict(_kinds())
+_KIND_OF: Final[Mapping[Callable[..., Any], str]] = {
+    made.psi: kind
+    for kind, factory in KINDS.items()
+    if kind not in ("box", "expr")
+    for made in flatten(factory(**dict.fromkeys(required(factory), OWNER)))
+}
 _GROUP_DEFAULTS: Final = {field.name: field.default for field in dataclasses.fields(Group)}
 _SIDES: Final = {side.psi: (-1.0, "low") if "low" in side.parameters else (1.0, "high") for side in box([0], [1])}
 """For the function of each side of a box: the sign of its normal, and the name of its parameter."""

@@ -23,18 +23,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 from numpy.typing import ArrayLike, NDArray
 
 from consat.numerics import once, stacked
 from consat.problem.constraints.composition import arranged, highest
 from consat.problem.constraints.node import Node, block, constant, opaque, position, signs
 from consat.problem.constraints.tracing import CALLS, describe, evaluate, interpret
+
+if TYPE_CHECKING:
+    from jax.extend import core
 
 Array = NDArray[Any]
 Psi = Callable[..., Any]
@@ -211,12 +213,12 @@ class _Family:
         positions = [position(slot, self.arity, self.dimension) for slot in range(self.arity)]
         arguments = [*positions, *(parameters[key] for key in sorted(parameters))]
         with np.errstate(all="ignore"), jax.enable_x64(True):
-            (node,) = interpret(self.trace, arguments, lambda value: constant(np.asarray(value)[None]), describe)
+            (node,) = interpret(self.trace.jaxpr, self.trace.consts, arguments, lambda value: constant(np.asarray(value)[None]), describe)
             return arranged([node], np.zeros((), int))
 
 
 @np.errstate(all="ignore")
-def _classify(node: Node, arity: int, members: int, *, moving: bool = False) -> tuple[Array, Array, Array]:
+def _classify(node: Node, arity: int, members: int, *, moving: bool) -> tuple[Array, Array, Array]:
     """The curvature of ψ from its node.
 
     Args:
@@ -339,7 +341,9 @@ def _evaluator(family: _Family) -> Callable[[Array, Array], tuple[Array, Array]]
             return [out * (1 + next(left)) if jnp.issubdtype(out.dtype, jnp.floating) else out for out in evaluate(eqn, *inputs)]
 
         x = (x * (1 + of_x)).reshape(family.arity, family.dimension)
-        (value,) = interpret(family.trace, [*x, *(parameters[key] for key in sorted(parameters))], jnp.asarray, step)
+        (value,) = interpret(
+            family.trace.jaxpr, family.trace.consts, [*x, *(parameters[key] for key in sorted(parameters))], jnp.asarray, step
+        )
         return value.reshape(())
 
     compiled = jax.jit(jax.vmap(jax.vmap(nudged, (None, None, 0)), (0, 0, None)))
@@ -369,5 +373,5 @@ def _computed(trace: core.ClosedJaxpr) -> list[Any]:
         avals.extend(var.aval for var in eqn.outvars)
         return [None] * len(eqn.outvars)
 
-    interpret(trace, [None] * len(trace.jaxpr.invars), lambda _: None, step)
+    interpret(trace.jaxpr, trace.consts, [None] * len(trace.jaxpr.invars), lambda _: None, step)
     return avals

@@ -57,8 +57,7 @@ def extended(psi: Psi, arity: int, dimension: int, parameters: Mapping[str, np.n
 
 @functools.lru_cache(maxsize=256)
 def _is_quadratic(psi: Psi, arity: int, dimension: int, shapes: tuple[tuple[str, tuple[int, ...], str], ...]) -> bool:
-    found = degree(psi, arity, dimension, {key: np.zeros(shape, dtype) for key, shape, dtype in shapes})
-    return found is not None and found <= 2
+    return degree(psi, arity, dimension, {key: np.zeros(shape, dtype) for key, shape, dtype in shapes}) is not None
 
 
 def _all_usable(arrays: Any) -> Array:

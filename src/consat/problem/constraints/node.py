@@ -161,7 +161,7 @@ def opaque(shape: tuple[int, ...]) -> Node:
     return unknown(shape, 0)
 
 
-def unknown(shape: tuple[int, ...], degree: int | None = None) -> Node:
+def unknown(shape: tuple[int, ...], degree: int | None) -> Node:
     """The node of a function of which only the shape and perhaps the degree are known."""
     infinite = np.full((1,) * (len(shape) + 1), np.inf)
     return Node(shape, degree, -infinite, infinite)

@@ -8,17 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 from numpy.typing import NDArray
 
 from consat.problem.constraints.atoms import ATOMS
 from consat.problem.constraints.composition import arranged, atom, dot, fold, larger, minus, negative, plus, power, raised, smaller, times
 from consat.problem.constraints.node import Node, constant, unknown
+
+if TYPE_CHECKING:  # the import loads Pallas, too
+    from jax.extend import core
 
 Array = NDArray[Any]
 T = TypeVar("T")
@@ -28,7 +30,8 @@ CALLS: Final = frozenset({"jit", "pjit", "closed_call", "core_call", "remat2", "
 
 
 def interpret(
-    closed: core.ClosedJaxpr,
+    jaxpr: core.Jaxpr,
+    constants: Sequence[Any],
     arguments: Sequence[T],
     constant: Callable[[Any], T],
     step: Callable[[core.JaxprEqn, Sequence[T]], Sequence[T] | None],
@@ -36,7 +39,8 @@ def interpret(
     """Evaluate a jaxpr on values of any kind.
 
     Args:
-        closed: the jaxpr.
+        jaxpr: the jaxpr.
+        constants: the arrays that it refers to.
         arguments: values of its inputs.
         constant: converts a number or array to such a value.
         step: evaluates one equation. It may return None for one of `CALLS`; then the inner jaxpr is evaluated.
@@ -44,23 +48,24 @@ def interpret(
     Returns:
         the values of its outputs.
     """
-    env: dict[Any, T] = dict(zip(closed.jaxpr.invars, arguments, strict=True))
-    env.update(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
+    env: dict[Any, T] = dict(zip(jaxpr.invars, arguments, strict=True))
+    env.update(zip(jaxpr.constvars, map(constant, constants), strict=True))
 
     def read(atom: Any) -> T:
-        return constant(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if isinstance(atom, core.Literal) else env[atom]
+        literal = hasattr(atom, "val")
+        return constant(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if literal else env[atom]
 
-    for eqn in closed.jaxpr.eqns:
+    for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
         outputs = step(eqn, inputs)
-        env.update(zip(eqn.outvars, interpret(body(eqn), inputs, constant, step) if outputs is None else outputs, strict=True))
-    return [read(atom) for atom in closed.jaxpr.outvars]
+        env.update(zip(eqn.outvars, interpret(*body(eqn), inputs, constant, step) if outputs is None else outputs, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
 
 
-def body(eqn: core.JaxprEqn) -> core.ClosedJaxpr:
-    """The inner jaxpr of an equation whose primitive is one of `CALLS`."""
+def body(eqn: core.JaxprEqn) -> tuple[core.Jaxpr, Sequence[Any]]:
+    """The inner jaxpr, and its constants, of an equation whose primitive is one of `CALLS`."""
     inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
-    return inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
 
 def evaluate(eqn: core.JaxprEqn, *inputs: Any) -> list[Any]:
@@ -156,7 +161,7 @@ def _is_logaddexp(eqn: core.JaxprEqn) -> bool:
         return False
     operands = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in _avals(eqn.invars)]
     (reference,) = jax.make_jaxpr(jnp.logaddexp)(*operands).eqns
-    return str(body(reference)) == str(body(eqn))
+    return str(body(reference)[0]) == str(body(eqn)[0])
 
 
 def _moved(eqn: core.JaxprEqn, inputs: Sequence[Node]) -> list[Node] | None:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from consat.problem.family import distinct
+from consat.numerics import distinct
 from consat.problem.graphs import middles
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates

@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from jax import Array
 
-from consat.numerics import laid_out, on_device
+from consat.numerics import distinct, laid_out, on_device
 from consat.problem.constraints.domain import Extended, extended
-from consat.problem.family import Family, distinct
+from consat.problem.family import Family
 from consat.problem.team import Team
 from consat.protocols.local.lanewise import bend_of
 
