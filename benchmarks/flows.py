@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import consat as cs
-from consat.engine.flows import CHUNK, Observer, Problem, _advance
+from consat.engine.flows import CHUNK, Observer, Problem, _advanced
 from consat.engine.recording import Choice
 from consat.numerics import float64
 from consat.problem.objective import SmoothingSchedule
@@ -90,13 +90,13 @@ def batch(starts: int) -> None:
     observer = Observer.of(team, copies, Choice.of(team, copies))
     first = jnp.asarray(np.random.default_rng(0).uniform(-4, 4, (starts, copies.count, 2)))
     times = [jnp.asarray(part) for part in np.linspace(0, UNTIL, 3001)[np.arange(0, 3000, CHUNK)[:, None] + np.arange(CHUNK + 1)]]
-    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advance().__wrapped__(flow, problem, observer, state, times))(states))
+    together = jax.jit(lambda states, times: jax.vmap(lambda state: _advanced.__wrapped__(flow, problem, observer, state, times))(states))
 
     def singles() -> None:
         for x in first:
             state = flow.start(x)
             for part in times:
-                _, state, *_ = _advance()(flow, problem, observer, state, part)
+                state = _advanced(flow, problem, observer, state, part).state
         jax.block_until_ready(state)
 
     def as_one() -> None:
@@ -105,7 +105,7 @@ def batch(starts: int) -> None:
             _, state, *_ = together(state, part)
         jax.block_until_ready(state)
 
-    jax.block_until_ready(_advance()(flow, problem, observer, flow.start(first[0]), times[0]))
+    jax.block_until_ready(_advanced(flow, problem, observer, flow.start(first[0]), times[0]))
     jax.block_until_ready(together(jax.vmap(flow.start)(first), times[0]))
     one, many = median(1, as_one), median(1, singles)
     print(f"one batch (adaptive, implicit, vmap): {one:.1f} s; {starts} warm runs: {many:.1f} s; runs/batch {many / one:.2f}")

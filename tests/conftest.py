@@ -16,11 +16,13 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / 
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("MYPY_CACHE_DIR", str(Path.home() / ".cache" / "consat" / "mypy"))  # two tests check the same libraries
 
 import hypothesis
 import jax
 import pytest
 
+gc.set_threshold(50_000, 20, 100)  # JAX traces make many objects and few cycles: an eighth of the suite would be spent looking for them
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

@@ -24,7 +24,7 @@ from consat.engine.rounds import later
 from consat.engine.rules import ENOUGH, HOLD, Rules
 from consat.engine.tally import Tally
 from consat.engine.world import World
-from consat.numerics import float64, on_device, quick_compilation
+from consat.numerics import float64, on_device, quickly_compiled
 from consat.protocols import Rounds
 from consat.protocols.estimates import Estimates
 from consat.results.trace import Ending
@@ -218,9 +218,8 @@ class _Pool:
         first = np.stack([self._lanes[lane].first for lane in self._lane_at])
         keys = jax.vmap(jax.random.key)(on_device(np.array([self._lanes[lane].seed for lane in self._lane_at])))
         self._varied = jax.tree.map(lambda leaf: leaf[self._of_lane[self._lane_at]], self._shared.varied)
-        begin, _, choose = _compiled()
-        now, chunk = begin(self._shared.plan, self._shared.fixed, self._varied, jnp.asarray(first), keys)
-        self._state = now if self._state is None else choose(on_device(fresh), now, self._state)
+        now, chunk = _begin(self._shared.plan, self._shared.fixed, self._varied, jnp.asarray(first), keys)
+        self._state = now if self._state is None else _chosen(on_device(fresh), now, self._state)
         chunk = jax.tree.map(np.asarray, chunk)
         for place in places:
             lane = self.running[place]
@@ -239,7 +238,9 @@ class _Pool:
             hold[place], most[place] = (HOLD, rules.most) if rules.stop == "satisfied" else (NEVER, NEVER)
             knowing[place] = ENOUGH[rules.stop]
         ask = Ask(*(on_device(values) for values in (number, rounds, streak, np.full_like(number, NEVER), hold, most, near, knowing)))
-        self._state, chunk = _compiled()[1](self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
+        assert self._state is not None
+        assert self._varied is not None
+        self._state, chunk = _advanced(self._shared.plan, self._shared.fixed, self._varied, self._state, ask)
         chunk, self._positions, self._estimates = jax.tree.map(np.asarray, (chunk, self._state.body, self._state.state.x))
         ended = []
         for place, lane in list(self.running.items()):
@@ -266,23 +267,21 @@ def _row(chunk: Chunk, place: int) -> Chunk:
     return Chunk(**scalars, kept=chunk.kept)
 
 
-@functools.cache
-def _compiled() -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    def nobody() -> Chosen:
-        return Chosen(*(jnp.zeros(0, jnp.int32) for _ in range(3)))
+def _nobody() -> Chosen:
+    return Chosen(*(jnp.zeros(0, jnp.int32) for _ in range(3)))
 
-    def begin(plan: _Plan, fixed: Any, varied: _Varied, first: Array, keys: Array) -> Any:
-        return jax.vmap(lambda varied, first, key: start(*plan.merged(fixed, varied), nobody(), first, key))(varied, first, keys)
 
-    def go_on(plan: _Plan, fixed: Any, varied: _Varied, now: Now, ask: Ask) -> Any:
-        return jax.vmap(lambda varied, now, ask: advance(*plan.merged(fixed, varied), nobody(), 1, now, ask))(varied, now, ask)
+@quickly_compiled("plan")
+def _begin(plan: _Plan, fixed: Any, varied: _Varied, first: Array, keys: Array) -> tuple[Now, Chunk]:
+    return jax.vmap(lambda varied, first, key: start(*plan.merged(fixed, varied), _nobody(), first, key))(varied, first, keys)
 
-    def choose(fresh: Array, new: Now, old: Now) -> Now:
-        return jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
-    options = quick_compilation()
-    return (
-        jax.jit(begin, static_argnames=("plan",), compiler_options=options),
-        jax.jit(go_on, static_argnames=("plan",), compiler_options=options),
-        jax.jit(choose, compiler_options=options),
-    )
+@quickly_compiled("plan")
+def _advanced(plan: _Plan, fixed: Any, varied: _Varied, now: Now, ask: Ask) -> tuple[Now, Chunk]:
+    return jax.vmap(lambda varied, now, ask: advance(*plan.merged(fixed, varied), _nobody(), 1, now, ask))(varied, now, ask)
+
+
+@quickly_compiled()
+def _chosen(fresh: Array, new: Now, old: Now) -> Now:
+    """The lanes of `new` that are `fresh`, (lanes,), and the others of `old`."""
+    return jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

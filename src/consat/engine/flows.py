@@ -7,16 +7,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax import Array
 
 from consat.engine.checkpoint import Checkpoint, fingerprint
 from consat.engine.loop import Steps, follow
 from consat.engine.recording import Choice, Memory, Rows, Sink
 from consat.engine.violations import shares, violated
-from consat.numerics import float64, on_device, quick_compilation
+from consat.numerics import float64, on_device, quickly_compiled
 from consat.problem.objective import Nu, Objective, SmoothingSchedule
 from consat.problem.team import Team
 from consat.problem.units import scale
@@ -160,46 +162,42 @@ class Advance(NamedTuple):
     moved: Array
 
 
-@functools.cache
-def _advance() -> Callable[..., Advance]:
-    """The compiled integration from ``times[0]`` over the samples ``times[1:]``. It ends early where it diverges or is too stiff."""
-    import diffrax
-    import optimistix
+@quickly_compiled("flow")
+def _advanced(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> Advance:
+    """The integration from ``times[0]`` over the samples ``times[1:]``. It ends early where it diverges or is too stiff."""
+    anchor = state.x[observer.own]
 
-    def solver(numbers: int) -> diffrax.AbstractSolver[Any]:
-        if numbers > MOST_IMPLICIT:
-            return diffrax.Tsit5()
-        # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
-        return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
+    def look(t: Array, y: State, _: Any) -> tuple[Rows, Array, Array]:
+        at = y.x[observer.own]
+        moved = jnp.max(jnp.abs(at - anchor), initial=0.0)
+        return observer.look(flow, problem, jnp.asarray(t), y), moved, violated(observer.objective, observer.watched, at)
 
-    def advance(flow: Flow, problem: Problem, observer: Observer, state: State, times: Array) -> Advance:
-        anchor = state.x[observer.own]
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, _: rate(flow, problem, jnp.asarray(t), y)),
+        _solver(state.x.size + state.z.size),
+        t0=times[0],
+        t1=times[-1],
+        dt0=None,
+        y0=state,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times[1:], fn=look), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=diffrax.PIDController(rtol=1e-7, atol=1e-9, dtmin=SHORTEST, force_dtmin=False),
+        max_steps=MOST_STEPS,
+        throw=False,
+        event=diffrax.Event(lambda t, y, _, **__: problem.astray(y)),
+    )
+    (seen, moved, wrong), last = solution.ys
+    end = jax.tree.map(lambda leaf: leaf[-1], last)
+    reached = jnp.isfinite(moved)
+    least = jnp.max(jnp.where(reached, moved, 0.0))
+    return Advance(seen, wrong & reached[:, None], reached, end, solution.ts[1][-1], problem.astray(end), least)
 
-        def look(t: Array, y: State, _: Any) -> tuple[Rows, Array, Array]:
-            at = y.x[observer.own]
-            moved = jnp.max(jnp.abs(at - anchor), initial=0.0)
-            return observer.look(flow, problem, jnp.asarray(t), y), moved, violated(observer.objective, observer.watched, at)
 
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, _: rate(flow, problem, jnp.asarray(t), y)),
-            solver(state.x.size + state.z.size),
-            t0=times[0],
-            t1=times[-1],
-            dt0=None,
-            y0=state,
-            saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times[1:], fn=look), diffrax.SubSaveAt(t1=True)]),
-            stepsize_controller=diffrax.PIDController(rtol=1e-7, atol=1e-9, dtmin=SHORTEST, force_dtmin=False),
-            max_steps=MOST_STEPS,
-            throw=False,
-            event=diffrax.Event(lambda t, y, _, **__: problem.astray(y)),
-        )
-        (seen, moved, wrong), last = solution.ys
-        end = jax.tree.map(lambda leaf: leaf[-1], last)
-        reached = jnp.isfinite(moved)
-        least = jnp.max(jnp.where(reached, moved, 0.0))
-        return Advance(seen, wrong & reached[:, None], reached, end, solution.ts[1][-1], problem.astray(end), least)
-
-    return jax.jit(advance, static_argnames=("flow",), compiler_options=quick_compilation())
+def _solver(numbers: int) -> diffrax.AbstractSolver[Any]:
+    """The solver for a state of so many floats."""
+    if numbers > MOST_IMPLICIT:
+        return diffrax.Tsit5()
+    # the chord method with a fresh Jacobian takes 2 to 7 times fewer steps here than Kvaerno5's own choice
+    return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optimistix.Chord)())
 
 
 _rate = jax.jit(rate, static_argnames=("flow",))
@@ -323,7 +321,7 @@ class _FlowSimulation:
         padded = np.pad(times, (0, CHUNK + 1 - len(times)), mode="edge")
         if not done and self._overflows():
             return self.look().where(np.zeros(1, dtype=bool)), "diverged"
-        ahead = _advance()(self.flow, self.problem, self.observer, self.state, on_device(padded))
+        ahead = _advanced(self.flow, self.problem, self.observer, self.state, on_device(padded))
         count = int(np.count_nonzero(np.asarray(ahead.reached)[: len(times) - 1]))
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], ahead.seen)._replace(step=times[1 : count + 1])
         if count == len(times) - 1:

@@ -5,11 +5,9 @@ A run advances it until a rule ends it, see `consat.engine.rounds`. A session ad
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jax import Array
 
@@ -19,11 +17,11 @@ from consat.engine.round import Now
 from consat.engine.tally import Tally
 from consat.engine.violations import shares
 from consat.engine.world import World
-from consat.numerics import quick_compilation
+from consat.numerics import quickly_compiled
 from consat.problem.team import Team
 
 if TYPE_CHECKING:
-    from consat.robots.drive import Report
+    from consat.robots.drive import Drive, Report
 
 
 class RoundsSimulation:
@@ -120,7 +118,7 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
     from consat.robots.simulated import Simulated
 
     drive, robots = world.drive, now.robots
-    report, stuck = _ended()(drive, robots.state, robots.memory, now.state.x[world.own])
+    report, stuck = _ended(drive, robots.state, robots.memory, now.state.x[world.own])
     noise, wind = (0.0 if leaf is None else float(np.linalg.norm(leaf)) for leaf in (world.noise, world.wind))
     gap, clear = float(report.smallest_distance), float(report.clearance)
     return {
@@ -134,9 +132,6 @@ def driven(team: Team, world: World, now: Now) -> dict[str, Any]:
     }
 
 
-@functools.cache
-def _ended() -> Callable[..., tuple[Report, Array]]:
-    """`Drive.ended` compiled as one program."""
-    from consat.robots.drive import Drive
-
-    return jax.jit(Drive.ended, static_argnums=0, compiler_options=quick_compilation())
+@quickly_compiled("drive")
+def _ended(drive: Drive, state: Any, memory: Any, targets: Array) -> tuple[Report, Array]:
+    return drive.ended(state, memory, targets)
