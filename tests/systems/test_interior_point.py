@@ -12,6 +12,7 @@ import pytest
 import consat as cs
 from consat.certify.optimum import max_min
 from consat.problem.units import scale
+from consat.runs.preparation import default_protocol, told
 from tests.unit import teams
 
 
@@ -86,13 +87,14 @@ def test_millimetres_and_kilometres_take_the_same_rounds(case: str) -> None:
 
 
 def test_norms_with_their_kinks_and_own_callables() -> None:
-    def reach(center: list[float], radius: float, name: str, who: str) -> cs.Constraint:
-        return cs.constraint(lambda p: radius - jnp.linalg.norm(p - jnp.asarray(center)), reads=(who,), name=name)
+    def disc(p: Any, *, center: Any) -> Any:
+        return 1.0 - jnp.linalg.norm(p - center)
 
     tie = cs.constraint(lambda a, b: 1.0 - jnp.linalg.norm(a - b), reads=("a", "b"), name="tie")
     for gap, exact in ((2.0, 1 / 3), (6.0, -1.0)):
         # three radii of 1 have to bridge the gap: the best margin is 1 − gap/3
-        team = cs.Team([cs.Agent("a", [reach([0.0, 0.0], 1.0, "goal", "a"), tie]), cs.Agent("b", [reach([gap, 0.0], 1.0, "goal", "b")])])
+        goals = [cs.constraint(disc, reads=(who,), name="goal", center=[x, 0.0]) for who, x in (("a", 0.0), ("b", gap))]
+        team = cs.Team([cs.Agent("a", [goals[0], tie]), cs.Agent("b", [goals[1]])])
         summary = cs.run(team, protocol="max-min", seed=1, rounds=80).summary
         assert summary["margin"] == pytest.approx(exact, abs=5e-3)
         assert summary["bounds"][1] >= exact - 1e-9
@@ -121,13 +123,18 @@ def test_who_conflicts_and_what_would_do_is_said() -> None:
 
 
 def test_the_default_goes_by_the_structure_of_the_team() -> None:
-    assert cs.run("case-a", rounds=1).summary["protocol"] == "interior-point"
-    assert cs.run("convoy", rounds=1).summary["protocol"] == "interior-point"
-    loops = cs.run("lattice", rounds=1).summary
+    def of(name: str, *changes: str, kind: str | None = None) -> dict[str, Any]:
+        asked = cs.load(name, changes)
+        return told(asked.team, asked.settings.protocol.model_copy(update={"kind": kind}))
+
+    assert of("case-a")["protocol"] == "interior-point"
+    assert cs.run("case-a", rounds=1).summary["protocol"] == "interior-point", "the run does as it is told"
+    assert of("convoy")["protocol"] == "interior-point"
+    loops = of("lattice")
     assert (loops["protocol"], loops["route"]) == ("interior-point", "links")
-    assert cs.run("lattice", rounds=1, protocol="max-min").summary["route"] == "tree"
-    assert cs.run("swarm", rounds=1).summary["protocol"] == "admm", "not concave, with loops"
-    assert cs.run(cs.load("convoy", ["count=6000"]), rounds=1).summary["protocol"] == "admm"
+    assert of("lattice", kind="max-min")["route"] == "tree"
+    assert of("swarm")["protocol"] == "admm", "not concave, with loops"
+    assert of("convoy", "count=6000")["protocol"] == "admm"
 
 
 def _three(*psis: str) -> cs.Team:
@@ -138,7 +145,7 @@ def _three(*psis: str) -> cs.Team:
 def test_the_default_with_loops_goes_by_the_kind_of_what_is_not_concave() -> None:
     plain = "4 - norm2(b)", "4 - norm2(c)"
     for psi, protocol in (("norm(a - b) - 1", "admm"), ("norm2(a - b) - 1", "admm"), ("sin(norm2(a - b))", "interior-point")):
-        assert cs.run(_three(psi, *plain), rounds=1).summary["protocol"] == protocol, psi
+        assert default_protocol(_three(psi, *plain), "local") == protocol, psi
 
 
 def test_a_model_that_holds_only_nearby_is_not_relied_on_far_away() -> None:
