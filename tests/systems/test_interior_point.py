@@ -12,7 +12,7 @@ import pytest
 import consat as cs
 from consat.certify.optimum import max_min
 from consat.problem.units import scale
-from consat.runs.preparation import default_protocol, told
+from consat.runs.preparation import default_protocol, protocol_entries
 from tests.unit import teams
 
 
@@ -125,7 +125,7 @@ def test_who_conflicts_and_what_would_do_is_said() -> None:
 def test_the_default_goes_by_the_structure_of_the_team() -> None:
     def of(name: str, *changes: str, kind: str | None = None) -> dict[str, Any]:
         asked = cs.load(name, changes)
-        return told(asked.team, asked.settings.protocol.model_copy(update={"kind": kind}))
+        return protocol_entries(asked.team, asked.settings.protocol.model_copy(update={"kind": kind}))
 
     assert of("case-a")["protocol"] == "interior-point"
     assert cs.run("case-a", rounds=1).summary["protocol"] == "interior-point", "the run does as it is told"

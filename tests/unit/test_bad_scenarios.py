@@ -383,13 +383,13 @@ def survives(text: str) -> None:
     assert time.process_time() - begin < 5  # milliseconds, but for a compilation or the garbage collector
 
 
-@hypothesis.settings(max_examples=1200, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=600, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(scrawled())
 def test_scrawled_text_is_read_or_refused(text: str) -> None:
     survives(text)
 
 
-@hypothesis.settings(max_examples=1200, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=600, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(twisted())
 def test_twisted_structure_is_read_or_refused(text: str) -> None:
     survives(text)

@@ -247,11 +247,11 @@ def check(scenario: str, overrides: tuple[str, ...], as_json: bool) -> int:
     loaded = _load(scenario, overrides)
     from consat.certify.assumptions import report
     from consat.problem.graphs import require_connected
-    from consat.runs.preparation import told
+    from consat.runs.preparation import protocol_entries
 
     findings = report(loaded.team)
     if findings["communication_connected"]:
-        findings |= told(loaded.team, loaded.settings.protocol)
+        findings |= protocol_entries(loaded.team, loaded.settings.protocol)
     findings["warnings"] = []
     if loaded.robots is not None:
         from consat.scenario.robots import blocked_goals

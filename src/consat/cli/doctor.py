@@ -129,9 +129,9 @@ def _lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     cache = found["cache"]
     state = "" if cache["writable"] else "; it cannot be written: set JAX_COMPILATION_CACHE_DIR"
     yield "compile cache", f"{cache['place']}, {cache['files']} programs, {cache['bytes'] / 2**20:.1f} MiB{state}"
-    for extra, told in found["extras"].items():
-        there = ", ".join(f"{library} {number}" for library, number in told["libraries"].items())
-        yield f"consat[{extra}]", there if told["installed"] else f"not installed: pip install 'consat[{extra}]'"
+    for extra, state in found["extras"].items():
+        there = ", ".join(f"{library} {number}" for library, number in state["libraries"].items())
+        yield f"consat[{extra}]", there if state["installed"] else f"not installed: pip install 'consat[{extra}]'"
     loopback = found["loopback"]
     port = "free" if loopback["free"] else "taken: use --port for launch and split"
     yield (

@@ -149,12 +149,12 @@ class Chosen:
 
 
 class _Loop(NamedTuple):
-    """Carry of the loop over rounds. `places`: number of recorded rounds; `told`: whether all agents know that all are satisfied."""
+    """Carry of the loop over rounds. `places`: number of recorded rounds; `all_know`: whether all agents know that all are satisfied."""
 
     done: Array
     now: Now
     streak: Array
-    told: Array
+    all_know: Array
     places: Array
     chunk: Chunk
 
@@ -240,13 +240,13 @@ def advance(protocol: Rounds, world: World, chosen: Chosen, capacity: int, now: 
         streak = jnp.where(seen[0] > 0, at.streak + 1, 0)
         known = seen[SCALARS.index("known")]
         near = jnp.where(known & ask.knowing > 0, chunk.near + 1, 0)
-        told = known & SATISFIED > 0
+        all_know = known & SATISFIED > 0
         return _Loop(
-            at.done + 1, now, streak, told, places, Chunk(at.done + 1, **numbers, near=near, drift=drift, violated=count, kept=kept)
+            at.done + 1, now, streak, all_know, places, Chunk(at.done + 1, **numbers, near=near, drift=drift, violated=count, kept=kept)
         )
 
     def goes_on(at: _Loop) -> Array:
-        satisfied = (at.streak >= ask.hold) & (at.told | (at.streak >= ask.most))
+        satisfied = (at.streak >= ask.hold) & (at.all_know | (at.streak >= ask.most))
         return (at.done < ask.rounds) & ~satisfied & (at.chunk.near < SURE)
 
     end = jax.lax.while_loop(goes_on, step, _Loop(empty.done, now, ask.streak, jnp.asarray(False), empty.done, empty))

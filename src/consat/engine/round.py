@@ -120,7 +120,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
     at = now.state.x if now.heard is None else now.heard.position
     known = Known(agreement.known(now.ages, everyone), everyone.margin(at))
     state, message = protocol.speak(now.state, everyone, round_, known)
-    ages, told = agreement.speak(now.ages, state.x, everyone)
+    ages, age = agreement.speak(now.ages, state.x, everyone)
     key, awake, through, bad = now.key, None, None, now.bad
     if world.rough:
         key, awake, through, bad = _drawn(world, now.key, now.bad)
@@ -138,7 +138,7 @@ def speak(protocol: Rounds, world: World, now: Now, round_: Array) -> Spoken:
         heard, word = agreement.speak_bodies(now.heard, body, world.owners, everyone)
         if awake is not None:
             heard = _where_awake(_BODIES, world, awake, heard, before.heard)
-    crossing, held, goes = Crossing(message, told, word), now.held, None if awake is None else _of_pairs(world, awake)
+    crossing, held, goes = Crossing(message, age, word), now.held, None if awake is None else _of_pairs(world, awake)
     if held is not None:
         crossing, held, goes = sending.sifted(
             protocol, everyone, crossing, held, world.pair, beat=float(sending.BEAT), lasting=not world.rough, talks=goes
@@ -217,14 +217,14 @@ def hear(protocol: Rounds, world: World, spoken: Spoken) -> tuple[Now, tuple[Arr
     """Second half of a round: every agent receives. Returns the state, and what all agents know; see `knowledge`."""
     everyone, ends, now = world.everyone, world.everyone.links, spoken.now
     arrived = jnp.ones(len(ends), dtype=bool) if spoken.went is None else ends.across(spoken.went)
-    message, told, word = spoken.crossing
-    told, word = jax.tree.map(ends.across, (told, word))
+    message, age, word = spoken.crossing
+    age, word = jax.tree.map(ends.across, (age, word))
     if protocol.speaks == "pair" and everyone.interior is not None and spoken.reached is not None:
         interior = everyone.interior
         state = protocol.hear(now.state, interior.across(message), pick(spoken.reached, interior.other), everyone)
     else:
         state = protocol.hear(now.state, jax.tree.map(ends.across, message), arrived, everyone)
-    ages, heard = agreement.hear(now.ages, told, arrived), now.heard
+    ages, heard = agreement.hear(now.ages, age, arrived), now.heard
     if heard is not None and word is not None and world.owners is not None:
         heard = agreement.hear_bodies(heard, word, arrived, world.owners, everyone)
     known = agreement.known(ages if heard is None else heard.ages, everyone) > 0

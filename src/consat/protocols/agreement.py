@@ -138,8 +138,8 @@ def speak_bodies(bodies: Bodies, measured: Array, owners: Owners, solver: Solver
     position = bodies.position.at[owners.own].set(jnp.where(sure[:, None], measured, before))
     stale = bodies.stale.at[owners.own].set(jnp.where(sure, 0.0, pick(bodies.stale, owners.own)))
     bodies = Bodies(position, stale, bodies.ages)
-    ages, told = _counted(bodies.ages, sure & all_heard(bodies, solver) & (solver.margin(position) > 0), solver)
-    return bodies._replace(ages=ages), Word(solver.links.at(position), solver.links.at(stale), told)
+    ages, age = _counted(bodies.ages, sure & all_heard(bodies, solver) & (solver.margin(position) > 0), solver)
+    return bodies._replace(ages=ages), Word(solver.links.at(position), solver.links.at(stale), age)
 
 
 def all_heard(bodies: Bodies, solver: Solver) -> Array:

@@ -35,12 +35,12 @@ class Crossing(NamedTuple):
 
     Attributes:
         message: message of the protocol; one row per link or per pair, see `consat.protocols.Rounds.speaks`.
-        told: (links,) ages, see `consat.protocols.agreement`.
+        age: (links,) ages, see `consat.protocols.agreement`.
         word: positions of bodies; None if bodies can jump.
     """
 
     message: Any
-    told: Array
+    age: Array
     word: Word | None
 
 
@@ -74,7 +74,7 @@ def passed(since: Array, fresh: Array, beat: Any) -> Array:
 def goes_on(crossing: Crossing) -> Crossing:
     """The meaning of silence if no message is lost: everything as before, and ages one round later."""
     word = crossing.word
-    return crossing._replace(told=_later(crossing.told), word=None if word is None else word._replace(age=_later(word.age)))
+    return crossing._replace(age=_later(crossing.age), word=None if word is None else word._replace(age=_later(word.age)))
 
 
 def _later(age: Array) -> Array:
@@ -106,7 +106,7 @@ def sifted(
     by_pair = protocol.speaks == "pair"
     differs, first = protocol.news(said.message, before.message, solver), held.since >= NEVER
     if not by_pair:
-        differs = _any(differs | _aged(said.told, before.told, most), pair, len(first))
+        differs = _any(differs | _aged(said.age, before.age, most), pair, len(first))
     differs |= first
     bodies = first | _any(_moved(said, before, held.place, most, solver), pair, len(first))
     goes, since = differs | bodies, passed(held.since, differs | bodies, beat)
@@ -115,8 +115,8 @@ def sifted(
     if talks is not None:
         goes, differs, since = goes & talks, differs & talks, jnp.where(talks, since, held.since)
     message = chosen(differs if by_pair else differs[pair], protocol.brief(said.message), before.message)
-    told, word = chosen(differs[pair], said.told, before.told), chosen(goes[pair], said.word, before.word)
-    crossing = Crossing(message, told, word)
+    age, word = chosen(differs[pair], said.age, before.age), chosen(goes[pair], said.word, before.word)
+    crossing = Crossing(message, age, word)
     return crossing, Held(crossing, since, None if said.word is None else said.word.position), goes
 
 
@@ -127,7 +127,7 @@ def _any(links: Array, pair: Array, pairs: int) -> Array:
 def _moved(said: Crossing, held: Crossing, place: Array | None, most: Any, solver: Solver) -> Array:
     """(links,) whether there is news of the position or the age of a body."""
     if said.word is None or held.word is None or place is None:
-        return jnp.zeros(len(said.told), bool)
+        return jnp.zeros(len(said.age), bool)
     away, step = (jnp.abs(said.word.position - other).max(axis=1, initial=0.0) for other in (held.word.position, place))
     found = (held.word.stale >= NEVER) & (said.word.stale < NEVER)
     return found | (away > jnp.maximum(PLACE * solver.length, LAG * step)) | _aged(said.word.age, held.word.age, most)

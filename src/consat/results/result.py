@@ -70,7 +70,9 @@ class Result:
     def binding(self, name: str) -> list[str]:
         """The ids of agents whose constraint with this name binds at the end of the run; empty if the summary does not list agents."""
         agents = (self.summary["agents"] or {}).items()
-        return [agent for agent, told in agents if any(c["name"] == name and (c["multiplier"] or 0) > SLIGHT for c in told["constraints"])]
+        return [
+            agent for agent, entry in agents if any(c["name"] == name and (c["multiplier"] or 0) > SLIGHT for c in entry["constraints"])
+        ]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write a NetCDF-4 file, which `Result.load` reads back without loss. Returns its path."""
@@ -202,8 +204,8 @@ def variables(named: Mapping[str, np.ndarray], *, integral: bool, bound: bool, h
 
 def attributes(summary: Mapping[str, Any], scenario: str | None) -> dict[str, Any]:
     """The attributes of a result file: schema, summary, scenario text, and some values of the summary."""
-    told = {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
-    return {"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or "", **told}
+    chosen = {key: summary[key] for key in ("version", "seed", "protocol", "status", "verdict")}
+    return {"schema": SCHEMA, "summary": json.dumps(summary), "scenario": scenario or "", **chosen}
 
 
 def dataset(trace: Trace, team: Team, summary: Mapping[str, Any], scenario: str | None) -> xr.Dataset:

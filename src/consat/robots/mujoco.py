@@ -387,11 +387,11 @@ def _name(robot: int) -> str:
 
 def _add(parent: ElementTree.Element, tag: str, /, **attributes: Any) -> ElementTree.Element:
     """Add an element. Attributes are text, numbers or vectors."""
-    told = {
+    attributes = {
         key: value if isinstance(value, str) else " ".join(f"{float(each):.10g}" for each in np.atleast_1d(value))
         for key, value in attributes.items()
     }
-    return ElementTree.SubElement(parent, tag, told)
+    return ElementTree.SubElement(parent, tag, attributes)
 
 
 def _in_space(vectors: Any) -> np.ndarray:

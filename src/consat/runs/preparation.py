@@ -133,7 +133,7 @@ def way_of(team: Team, kind: str, layout: Layout) -> Way:
     return route_of(team, layout, exact=kind == "max-min")
 
 
-def told(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
+def protocol_entries(team: Team, asked: ProtocolSettings) -> dict[str, Any]:
     """The keys ``protocol``, ``route`` and ``why`` of ``run --json`` and ``check --json``. `asked`: protocol settings, whose kind is None
     for the default protocol."""
     kind = asked.kind or default_protocol(team, asked.estimates)

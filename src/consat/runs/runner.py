@@ -24,7 +24,7 @@ from consat.results.result import RESULT, Result
 from consat.results.trace import Trace
 from consat.runs.advice import around_loops
 from consat.runs.options import Options
-from consat.runs.preparation import Prepared, named, robots_of, scenario_of, settings_of, told, with_auxiliary
+from consat.runs.preparation import Prepared, named, protocol_entries, robots_of, scenario_of, settings_of, with_auxiliary
 from consat.runs.restarting import BRIEFLY, ELSEWHERE, best_start, looks_elsewhere
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, loads
@@ -173,7 +173,7 @@ def _start(scenario: Scenario, options: Options, files: Files | None, full: bool
     kind = str(settings.protocol.kind)
     if jax.process_count() > 1:
         _require_simple(kind, team, options, files is not None and files.checkpoints(about) is not None)
-    more = told(team, settings.protocol.model_copy(update={"kind": named(scenario.settings, options)}))
+    more = protocol_entries(team, settings.protocol.model_copy(update={"kind": named(scenario.settings, options)}))
     keep = _Keep(options, files, about)
     how: dict[str, Any] = {"stop": options.stop_for(kind), "progress": progress}
     if kind in FLOWS:

@@ -93,7 +93,7 @@ def summarise(
         ],
         "result": None,
         "seconds": {key: round(value, 4) for key, value in trace.seconds.items()},
-    } | ({"robots": None, "obstacles": None} if robots is None else robots.told)
+    } | ({"robots": None, "obstacles": None} if robots is None else robots.entries)
 
 
 def _verdicts(team: Team, trace: Trace, since: float) -> list[dict[str, Any]]:
@@ -134,8 +134,8 @@ def _agents(team: Team, margins: np.ndarray, multipliers: np.ndarray, violated: 
     np.minimum.at(least, team.owner, margins)
     agents: dict[str, Any] = {agent: {"margin": number(value), "constraints": []} for agent, value in zip(team.ids, least, strict=True)}
     for owner, name, margin, multiplier, share in zip(team.owner, team.names, margins, multipliers, violated, strict=True):
-        told = {"name": name, "margin": number(margin), "multiplier": number(multiplier), "violated_share": number(share)}
-        agents[team.ids[owner]]["constraints"].append(told)
+        entry = {"name": name, "margin": number(margin), "multiplier": number(multiplier), "violated_share": number(share)}
+        agents[team.ids[owner]]["constraints"].append(entry)
     return agents
 
 

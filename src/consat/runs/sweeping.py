@@ -252,10 +252,10 @@ class _Asked:
         total, ended = len(combinations) * len(seeds), 0
         for key, lanes in batches.items():
 
-            def told(done: float, share: float, before: int = ended, count: int = len(lanes)) -> None:
+            def report(done: float, share: float, before: int = ended, count: int = len(lanes)) -> None:
                 progress((before + done * count) / total, share)
 
-            found = simulate_batch(protocols[key], [lane for _, lane in lanes], told)
+            found = simulate_batch(protocols[key], [lane for _, lane in lanes], report)
             outcomes |= {place: outcome for (place, _), outcome in zip(lanes, found, strict=True)}
             ended += len(lanes)
         return [
@@ -283,12 +283,12 @@ class _Asked:
                 agents="none",
                 record=False,
             )
-            told: Mapping[str, Any] = {**result.summary}
-            since = told["satisfied_from"]["round"] if told["rounds"] is not None else told["satisfied_from"]["time"]
-            satisfied += told["status"] == "satisfied"
+            summary: Mapping[str, Any] = {**result.summary}
+            since = summary["satisfied_from"]["round"] if summary["rounds"] is not None else summary["satisfied_from"]["time"]
+            satisfied += summary["status"] == "satisfied"
             progress((k + 1) / total, satisfied / (k + 1))
-            measured = {name: since if name == "satisfied_from" else told[name] for name in MEASURED}
-            yield {**combination.chosen, "seed": seed, **{key: told[key] for key in ("status", "verdict", "ending")}, **measured}
+            measured = {name: since if name == "satisfied_from" else summary[name] for name in MEASURED}
+            yield {**combination.chosen, "seed": seed, **{key: summary[key] for key in ("status", "verdict", "ending")}, **measured}
 
 
 def _probability(name: str, value: Any) -> float:

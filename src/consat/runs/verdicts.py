@@ -102,19 +102,19 @@ def intervals(found: Sequence[Instant]) -> list[dict[str, Any]]:
             groups[-1].append(each)
         else:
             groups.append([each])
-    told: list[dict[str, Any]] = []
+    spans: list[dict[str, Any]] = []
     for k, group in enumerate(groups):
         if k:
-            _say(told, groups[k - 1][-1].time, group[0].time, "undecided", [groups[k - 1][-1], group[0]])
-        _say(told, group[0].time, group[-1].time, group[0].verdict, group)
-    return told
+            _say(spans, groups[k - 1][-1].time, group[0].time, "undecided", [groups[k - 1][-1], group[0]])
+        _say(spans, group[0].time, group[-1].time, group[0].verdict, group)
+    return spans
 
 
-def _say(told: list[dict[str, Any]], start: float, stop: float, verdict: Verdict, over: Sequence[Instant]) -> None:
-    if told and told[-1]["verdict"] == verdict:
-        told[-1]["to"] = stop
+def _say(spans: list[dict[str, Any]], start: float, stop: float, verdict: Verdict, over: Sequence[Instant]) -> None:
+    if spans and spans[-1]["verdict"] == verdict:
+        spans[-1]["to"] = stop
         return
     uppers = [each.upper for each in over]
     upper = None if any(each is None for each in uppers) else max(each for each in uppers if each is not None)
     lower = min(each.lower for each in over)
-    told.append({"from": start, "to": stop, "verdict": verdict, "bounds": [lower if np.isfinite(lower) else None, upper]})
+    spans.append({"from": start, "to": stop, "verdict": verdict, "bounds": [lower if np.isfinite(lower) else None, upper]})

@@ -58,7 +58,7 @@ class Robots:
         return {"robots": model_data(self.common), "obstacles": [obstacle_data(each) for each in self.obstacles], "own": own}
 
     @property
-    def told(self) -> dict[str, Any]:
+    def entries(self) -> dict[str, Any]:
         """Plain data as in ``run --json``: like `data`, with ``own`` inside ``robots``."""
         data = self.data
         own = {"own": data["own"]} if data["own"] else {}

@@ -59,9 +59,9 @@ class Client:
         self.allowance = Allowance()
         self._seen: dict[str, int] = {}
 
-    def answer(self, told: dict[str, Any]) -> None:
+    def answer(self, answer: dict[str, Any]) -> None:
         """Answer an order. May be called from any thread."""
-        self.answers.append(json.dumps(told, allow_nan=False))
+        self.answers.append(json.dumps(answer, allow_nan=False))
         self._wake()
 
     def take(self, raw: str | bytes) -> None:

@@ -128,17 +128,17 @@ class Display:
 
     def _assess(self, asked: tuple[int, Team | None]) -> None:
         revision, team = asked
-        told: dict[str, Any] = {"type": "verdict", "revision": revision, "verdict": "undecided", "bounds": [None, None], "reasons": []}
+        message: dict[str, Any] = {"type": "verdict", "revision": revision, "verdict": "undecided", "bounds": [None, None], "reasons": []}
         if team is None:
-            told["reasons"] = [f"a team of more than {MOST_ASSESSED:,} constraints is not assessed while it lives; use consat solve"]
+            message["reasons"] = [f"a team of more than {MOST_ASSESSED:,} constraints is not assessed while it lives; use consat solve"]
         else:
             try:
                 found = assessed(team)
             except ConsatError as error:
-                told["reasons"] = [str(error)]
+                message["reasons"] = [str(error)]
             else:
-                told |= {"verdict": found.verdict, "bounds": list(found.bounds), "reasons": list(found.reasons)}
-        self.show("verdict", told)
+                message |= {"verdict": found.verdict, "bounds": list(found.bounds), "reasons": list(found.reasons)}
+        self.show("verdict", message)
 
     def _trace(self, asked: tuple[Scene, Team, np.ndarray]) -> None:
         scene, team, x = asked

@@ -165,9 +165,9 @@ class Simulation:
             if each.key is not None and last[each.key] != k:
                 late.setdefault(each.key, []).append(each)
                 continue
-            told = self._answered(each)
+            answer = self._answered(each)
             for other in [*(late.pop(each.key, []) if each.key is not None else []), each]:
-                other.answer(told | {"id": other.order.id})
+                other.answer(answer | {"id": other.order.id})
 
     def _answered(self, pending: Pending) -> dict[str, Any]:
         try:

@@ -71,11 +71,11 @@ class Bodies:
 def robots(result: Result, data: xr.Dataset) -> tuple[Bodies | None, tuple[Obstacle, ...]]:
     """The bodies of the agents in `data`, the recorded steps of a result, and the obstacles; None and () if the run had no robot layer."""
     summary = result.summary
-    told = summary.get("robots")
-    if told is None:
+    entry = summary.get("robots")
+    if entry is None:
         return None, ()
-    common = {key: value for key, value in told.items() if key != "own"}
-    known = Robots.of({"robots": common, "obstacles": summary.get("obstacles") or [], "own": told.get("own", {})})
+    common = {key: value for key, value in entry.items() if key != "own"}
+    known = Robots.of({"robots": common, "obstacles": summary.get("obstacles") or [], "own": entry.get("own", {})})
     radius, offset = sizes(known, [str(agent) for agent in data["agent"].values])
     return Bodies(radius, offset, data["heading"].values if "heading" in data else None, offset > 0), known.obstacles
 

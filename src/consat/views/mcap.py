@@ -77,8 +77,8 @@ def save(result: Result, path: Path) -> None:
                 each.log(finite, log_time=nanoseconds)
             entities = [*scene.entities(k, stamp), *robots.entities(k, x[k], stamp)]
             pictures.log(messages.SceneUpdate(entities=entities), log_time=nanoseconds)
-            told = {"margin": number(margin[k]), "smooth_margin": number(smooth[k]), "step": float(steps[k])}
-            numbers.log(told, log_time=nanoseconds)
+            row = {"margin": number(margin[k]), "smooth_margin": number(smooth[k]), "step": float(steps[k])}
+            numbers.log(row, log_time=nanoseconds)
 
 
 def _schema(names: list[str]) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def result(found: Result) -> str:
     agents, positions = summary["agents"], summary["positions"]
     table = ""
     if agents is not None and positions is not None:
-        margins = {agent: np.inf if told["margin"] is None else told["margin"] for agent, told in agents.items()}
+        margins = {agent: np.inf if entry["margin"] is None else entry["margin"] for agent, entry in agents.items()}
         order = sorted(margins, key=margins.__getitem__)
         shown = list(agents) if len(agents) <= MOST_ROWS else order[:MOST_ROWS]
         rows = ((agent, _place(positions[agent]), _said(agents[agent]["margin"])) for agent in shown)
@@ -197,8 +197,8 @@ def sweep(summary: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
         cells = [str(value) for value in group["values"].values()]
         cells.append(f"{group['success']:.0%} of {group['runs']}")
         for name in ("satisfied_from", "margin"):
-            told = group[name]
-            cells.append("–" if told is None else f"{_said(told['median'])} ({_said(told['10 %'])} to {_said(told['90 %'])})")
+            spread = group[name]
+            cells.append("–" if spread is None else f"{_said(spread['median'])} ({_said(spread['10 %'])} to {_said(spread['90 %'])})")
         rows.append(cells)
     note = "<p>median over the seeds (from the 10th to the 90th percentile)</p>"
     title = f"{counted(summary['count'], 'run')} of {summary['protocol']} in {summary['seconds']:.1f} s"

@@ -193,7 +193,7 @@ def _regions(
     found = shapes(team, times[-1])
     moments = _samples(x, MOST_OUTLINED) if team.moves else np.zeros(0, dtype=int)
     seen = [shapes(team, times[moment]) for moment in moments]
-    told: dict[str, list[Mapping[str, Any]]] = {
+    regions: dict[str, list[Mapping[str, Any]]] = {
         "balls": [
             {**ball, "track": _ball_track(moments, seen, k) if seen and found.balls.moves[k] else None}
             for k, ball in enumerate(page_data.balls_of(team, found.balls))
@@ -201,7 +201,7 @@ def _regions(
         "walls": _walls(team, [*seen, found], moments, (low, high)),
         "outlines": _outlines(team, found.others, x, times, low, high),
     }
-    return low, high, told
+    return low, high, regions
 
 
 def _ball_track(moments: np.ndarray, seen: Sequence[Shapes], k: int) -> Mapping[str, Any]:

@@ -217,13 +217,13 @@ class Scene:
     def _region_lines(self) -> Iterator[Any]:
         """Legend entries for regions: one per name; for many regions, the meaning of the line styles only."""
         line = functools.partial(Line2D, [], [])
-        told = {f"{self._owners(area)}: {plain(area.name)}": area for area in reversed(self._areas)}
-        if len(told) > MOST_ENTRIES:
+        entries = {f"{self._owners(area)}: {plain(area.name)}": area for area in reversed(self._areas)}
+        if len(entries) > MOST_ENTRIES:
             yield line(color=GREY, linewidth=1.2, label="edge of a constraint")
             if any(area.keeps_out for area in self._areas):
                 yield areas.legend_patch(SHARED, "keep out")
         else:
-            for name, area in reversed(told.items()):
+            for name, area in reversed(entries.items()):
                 dash: Any = "-" if self._space else area.style
                 if area.keeps_out:
                     yield areas.legend_patch(area.colour, f"{name}, keep out")

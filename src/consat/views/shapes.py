@@ -135,12 +135,12 @@ def alike(team: Team) -> np.ndarray:
     """
     found, instants = np.arange(len(team.owner)), team.instants
     for place, family in enumerate(team.families):
-        told = [np.ascontiguousarray(value) for instant in instants for _, value in sorted(instant.families[place].parameters.items())]
+        values = [np.ascontiguousarray(value) for instant in instants for _, value in sorted(instant.families[place].parameters.items())]
         first: dict[Hashable, int] = {}
         for k in np.argsort(family.number).tolist():
             reads = tuple(-1 if agent == family.owner[k] else int(agent) for agent in family.agents[k])
             number = int(family.number[k])
-            found[number] = first.setdefault((reads, *(value[k].tobytes() for value in told)), number)
+            found[number] = first.setdefault((reads, *(value[k].tobytes() for value in values)), number)
     return found
 
 

@@ -122,9 +122,9 @@ def over_time(summary: Mapping[str, Any]) -> str:
     """Text of the intervals in which moving constraints can, or cannot, all hold. Short undecided intervals are left out."""
     verdicts = summary["verdicts"]
     duration = verdicts[-1]["to"]
-    told = [each for each in verdicts if each["verdict"] != "undecided" or each["to"] - each["from"] >= SLIGHT * duration]
-    spans = [f"{each['verdict']} from {number(each['from'])} to {number(each['to'])} s" for each in told[:MOST_INTERVALS]]
-    left = len(told) - len(spans)
+    certain = [each for each in verdicts if each["verdict"] != "undecided" or each["to"] - each["from"] >= SLIGHT * duration]
+    spans = [f"{each['verdict']} from {number(each['from'])} to {number(each['to'])} s" for each in certain[:MOST_INTERVALS]]
+    left = len(certain) - len(spans)
     return "; ".join(spans) + (f"; and {left} more intervals" if left else "")
 
 
@@ -137,40 +137,40 @@ def kept_up(summary: Mapping[str, Any]) -> str:
     duration, rounds = motion["duration"], summary["rounds"]
     later = motion["satisfied_share"] / share  # both count the same satisfied rounds: the ratio is the share of later rounds
     before = (1 - later) * (rounds + 1) / max(rounds, 1) * duration
-    told = "at all times" if share == 1 else f"for {math.floor(1000 * share) / 10:g} % of the time"
-    return f"every constraint held {told} after t = {number(before)} s; worst margin {number(motion['worst_margin_after'])}"
+    when = "at all times" if share == 1 else f"for {math.floor(1000 * share) / 10:g} % of the time"
+    return f"every constraint held {when} after t = {number(before)} s; worst margin {number(motion['worst_margin_after'])}"
 
 
 def bodies(summary: Mapping[str, Any]) -> str:
     """Text of contacts, smallest distances between robots and to obstacles, and robots that were stuck."""
     motion = summary["motion"]
     gap, clear, contacts = (motion[key] for key in ("smallest_distance", "clearance", "contacts"))
-    told = ["nobody touched" if not contacts else counted(contacts, "pair", "pairs") + " touched"]
+    parts = ["nobody touched" if not contacts else counted(contacts, "pair", "pairs") + " touched"]
     near = [f"{number(gap)} m apart at least"] if gap is not None else []
     near += [f"{number(clear)} m from obstacles"] if clear is not None else []
-    told += [", ".join(near)] if near else []
-    told += [f"bodies and contacts by {simulator}"] if (simulator := motion.get("simulator")) else []
+    parts += [", ".join(near)] if near else []
+    parts += [f"bodies and contacts by {simulator}"] if (simulator := motion.get("simulator")) else []
     stuck = [_short(agent) for agent in motion["stuck"]]
     more = f", and {len(stuck) - MOST_STUCK} more" if len(stuck) > MOST_STUCK else ""
-    return "; ".join([*told, *([f"stuck: {', '.join(stuck[:MOST_STUCK])}{more}"] if stuck else [])])
+    return "; ".join([*parts, *([f"stuck: {', '.join(stuck[:MOST_STUCK])}{more}"] if stuck else [])])
 
 
 def _way(summary: Mapping[str, Any], way: Mapping[str, Any]) -> str:
     """Text of the constraints that were violated for the largest share of a run, whether or not they hold at the end."""
     worst = way["worst"]
-    told = [(worst["violated_share"], worst["agent"], worst["constraint"])]
+    shares = [(worst["violated_share"], worst["agent"], worst["constraint"])]
     if summary.get("agents") is not None:
-        told = [
+        shares = [
             (constraint["violated_share"], agent, constraint["name"])
             for agent, entry in summary["agents"].items()
             for constraint in entry["constraints"]
             if constraint["violated_share"]
         ]
-    told.sort(key=lambda each: -each[0])
-    (share, agent, name), *others = told[:MOST_VIOLATED]
+    shares.sort(key=lambda each: -each[0])
+    (share, agent, name), *others = shares[:MOST_VIOLATED]
     first = f"{_short(agent)}: {_short(name)} violated for {_share(share)} of the run"
     named = ", ".join([first, *(f"{_short(agent)}: {_short(name)} for {_share(share)}" for share, agent, name in others)])
-    left = way["violated"] - min(len(told), MOST_VIOLATED)
+    left = way["violated"] - min(len(shares), MOST_VIOLATED)
     more = f", and {left:,} more" if left else ""
     return named + more
 

@@ -28,7 +28,7 @@ from consat.problem.units import automatic, scale
 from consat.protocols import ROUNDS
 from consat.results.result import Result
 from consat.results.trace import Ending
-from consat.runs.preparation import copies_of, default_protocol, told
+from consat.runs.preparation import copies_of, default_protocol, protocol_entries
 from consat.runs.summary import summarise
 from consat.scenario import Scenario, dump
 from consat.scenario.document import decode
@@ -152,7 +152,7 @@ def launch(scenario: Scenario, plan: Plan, *, quiet: bool = True, full: bool = F
         team = team.at(float(trace.steps[-1]) * (trace.period or 1.0))
         scenario = replace(scenario, team=team, text=dump(team, settings, scenario.name))
     summary = summarise(scenario, settings, schedule, size, trace, full=full)
-    summary |= told(team, settings.protocol) | {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
+    summary |= protocol_entries(team, settings.protocol) | {"mode": plan.mode, "network": observer.network() | {"ended": ended}}
     if supervisor.tree is not None:
         summary |= {"route": "tree", "why": "the links form loops and had not satisfied the team in time; it went over to a spanning tree"}
     summary["warnings"] += [*map(_warning, ended), *([] if scenario.robots is None else [BODILESS])]

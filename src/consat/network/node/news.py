@@ -69,7 +69,7 @@ def _filtered(
     if protocol.speaks == "pair":
         held = Rows(words, packing.pack(crossing.message))
     else:
-        held = rows._replace(link=jnp.concatenate([packing.pack(crossing.message), crossing.told[:, None], words], axis=1))
+        held = rows._replace(link=jnp.concatenate([packing.pack(crossing.message), crossing.age[:, None], words], axis=1))
     return held, after.since, after.place, goes
 
 

@@ -106,7 +106,7 @@ class Interior:
             gains: gains of the protocol.
         """
         units, pairs, inbox = self.units, len(self.talker), self._counted(inbox)
-        y, told = _normal(memory.y, units), margin / units.psi
+        y, body_margin = _normal(memory.y, units), margin / units.psi
 
         def turn(batch: Batch) -> tuple[Memory, Mail]:
             agents, rows, ends, shared = batch.agents, batch.rows, batch.pairs, batch.shared
@@ -123,9 +123,8 @@ class Interior:
                 at(inbox.matrix), at(inbox.vector), at(inbox.barrier, -1.0), at(inbox.level), at(inbox.margin, jnp.inf), at(inbox.changes),
                 Proof(*map(at, inbox.proof)),
             )  # fmt: skip
-            found, mail = step.act(
-                _lanes(batch, units, gains, self.plan.exact), shared, rows < len(y), mine, heard, told=told[agents], gains=gains
-            )
+            lanes = _lanes(batch, units, gains, self.plan.exact)
+            found, mail = step.act(lanes, shared, rows < len(y), mine, heard, body_margin=body_margin[agents], gains=gains)
             return _out(found), jax.tree.map(lambda leaf: _widened(leaf, self.plan.width), mail)
 
         found = [turn(batch) for batch in self.plan.batches]
@@ -134,8 +133,8 @@ class Interior:
 
     def least(self, inbox: Mail, margin: Array) -> Array:
         """(N,) the smallest margin of the team that each agent knows of. `margin`: (N,) its own."""
-        told = self._counted(inbox).margin * self.units.psi
-        return jnp.minimum(margin, jax.ops.segment_min(told, self.talker, len(margin), indices_are_sorted=True))
+        theirs = self._counted(inbox).margin * self.units.psi
+        return jnp.minimum(margin, jax.ops.segment_min(theirs, self.talker, len(margin), indices_are_sorted=True))
 
     def _counted(self, inbox: Mail) -> Mail:
         """Keep only the margins received along the spanning tree: around a loop an outdated margin would circulate for ever."""

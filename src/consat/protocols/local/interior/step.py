@@ -80,7 +80,7 @@ class Point(NamedTuple):
     inertia: Array
 
 
-def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *, told: Array, gains: Gains) -> tuple[Memory, Mail]:
+def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *, body_margin: Array, gains: Gains) -> tuple[Memory, Mail]:
     """Take one Newton step on the own constraints and the neighbours' quadratics; compute a quadratic and a proof for each neighbour.
 
     Args:
@@ -89,7 +89,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
         held: (n, A) false where copies are padded.
         memory: state before the step.
         inbox: the last message of each neighbour.
-        told: (A,) the agent's margin at the positions of the bodies.
+        body_margin: (A,) the agent's margin at the positions of the bodies.
         gains: gains of the protocol.
 
     Returns:
@@ -104,7 +104,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
 
     began = memory._replace(y=predicted(lanes, memory))
     here = Here.of(lanes, began.y)
-    known = jnp.minimum(told, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
+    known = jnp.minimum(body_margin, jnp.min(inbox.margin, axis=0, initial=jnp.inf))
     hold = jnp.where((known > 0) & lanes.bent.any(axis=0) & ~lanes.moves, HOLD, 1.0)
     point = lowered(lanes, here, memory._replace(inertia=hold * memory.inertia), lowest, gains)
     y, level, multiplier, swing, inertia = moved(lanes, here, began, point, theirs, gains)
@@ -122,7 +122,7 @@ def act(lanes: Lanes, shared: Array, held: Array, memory: Memory, inbox: Mail, *
         e,
         jnp.where(speaks[None], point.barrier[None], -1.0) + every,
         point.level[None] + every,
-        _least_of_others(jnp.concatenate([told[None], inbox.margin]))[1:],
+        _least_of_others(jnp.concatenate([body_margin[None], inbox.margin]))[1:],
         changes[None] + every,
         proof,
     )
