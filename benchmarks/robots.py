@@ -529,6 +529,7 @@ def measured(name: str, asked: argparse.Namespace, kept: Path) -> None:
 
 def keep(path: Path, name: str, part: dict[str, Any]) -> None:
     known = json.loads(path.read_text()) if path.exists() else {}
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(known | {name: part}, indent=1) + "\n")
 
 
