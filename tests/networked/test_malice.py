@@ -116,7 +116,10 @@ def test_one_poisoned_message_does_no_lasting_harm(mode: str, poison: str) -> No
     assert off(team) < 1e-2
     for source, victim in (("a1", "a2"), ("a2", "a3")):
         forge(team, source, victim, (POISON | ROUNDS | LIES.get(mode, {}))[poison])
-    team.run(10.0 if poison in LIES.get(mode, {}) else 6.0)  # what was believed, some 500 in the multipliers, is worked off at 0.3 a round
+    for _ in range(5 if poison in LIES.get(mode, {}) else 3):
+        team.run(2.0)  # what was believed, some 500 in the multipliers, is worked off at 0.3 a round
+        if off(team) < 1e-3:
+            break
     assert off(team) < 1e-3
     for agent, runner in team.runners.items():
         assert not runner.station.membership.gone, agent
