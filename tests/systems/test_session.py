@@ -311,6 +311,30 @@ def test_a_body_that_is_pushed_comes_back() -> None:
     assert jumps.satisfied
 
 
+def test_a_result_is_of_the_team_as_it_is_also_before_the_next_step() -> None:
+    session = cs.Session(trio()).step(20)
+    assert session.result().summary["satisfied_from"]["round"] is not None
+    result = session.place("a1", [50, 50]).result()
+    assert (result.summary["status"], result.summary["satisfied_from"]["round"]) == ("not-converged", None)
+    assert result.summary["positions"]["a1"] == [50, 50]
+    assert result.summary["margin"] == session.margin == result.data["margin"].values[-1] < 0
+    assert result.data["position"].values[-1, 0].tolist() == [50, 50]
+    assert len(result.data["position"]) == 21
+    result = session.step(20).add(cs.Agent("a4", [cs.near("a3", 1)], start=[-3, 0])).result()
+    assert result.summary["positions"]["a4"] == [-3, 0]
+    assert result.summary["margin"] == session.margin == result.data["margin"].values[-1]
+    assert len(cs.Session(trio()).place("a1", [50, 50]).result().data["position"]) == 1
+
+
+def test_steps_that_are_not_recorded_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("consat.engine.recording.MOST_KEPT", 600)
+    session = cs.Session(trio())
+    for _ in range(100):
+        session.step()
+    assert session._record.every > 1
+    assert all(len(part.step) for part in session._record._rows)
+
+
 def test_a_box_is_changed_as_a_whole() -> None:
     session = cs.Session(cs.Team([cs.Agent("a", [cs.box([0, 0], [1, 1]), cs.within([0, 0], 9)], start=[5, 5])])).step(20)
     session.change("a", "box", low=[2, 2], high=[3, 3]).step(30)

@@ -129,9 +129,10 @@ class Session:
         return self
 
     def _take(self, rows: Rows) -> None:
-        recorded = len(rows.step) and rows.step[-1] == self.round
-        self._record.append(rows)
-        self._own_margins, self._stepped = rows.agent_margin[-1] if recorded else None, True
+        self._own_margins, self._stepped = None, True
+        if len(rows.step):
+            self._record.append(rows)
+            self._own_margins = rows.agent_margin[-1] if rows.step[-1] == self.round else None
 
     @property
     def round(self) -> int:
@@ -358,11 +359,15 @@ class Session:
         """Result of the rounds so far, as of `consat.run`. Agents that were removed are not in it."""
         ready, simulation, team = self._running.ready, self._running.simulation, self.team
         rows = self._record.close()
-        if rows.step[-1] != self.round:
-            rows = rows.joined(simulation.look())
+        rows = rows.where(rows.step < self.round + self._stepped)  # without a last row that is of the team before a change
+        if not len(rows.step) or rows.step[-1] != self.round:
+            rows = rows.joined(self._present())
         seconds = {"compile": 0.0, "run": 0.0}
         trace = traced(simulation, rows, ready.copies, simulation.choice, ending="out of time", seconds=seconds)
-        trace = dataclasses.replace(trace, known=self.known, known_from=None, violated=None)  # they were counted with other constraints
+        trace = dataclasses.replace(
+            trace, known=self.known, satisfied_from=trace.satisfied_from if self.satisfied else None,
+            known_from=None, violated=None,  # they were counted with other constraints
+        )  # fmt: skip
         summary = summarise(
             dataclasses.replace(scenario_of(team), name=self._name), ready.settings, ready.schedule, ready.size, trace,
             robots=self._options.robots, since=self._changed_at / self.rate,
@@ -385,6 +390,11 @@ class Session:
         if self._own_margins is None:
             self._own_margins = self._running.margins
         return self._own_margins
+
+    def _present(self) -> Rows:
+        """Record of the team as it is."""
+        rows = self._running.simulation.look()
+        return rows if self._stepped else rows._replace(margin=np.array([self.margin]), smooth_margin=np.full(1, np.nan))
 
     def _restructure(self, team: Team, options: Options | None = None) -> None:
         """Change the structure of the team, or the options. If an error is raised, the session is unchanged."""

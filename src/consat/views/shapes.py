@@ -1,7 +1,7 @@
 """Geometry of library constraints: balls and half-spaces. A region that several agents share is listed once.
 
 The geometry is computed from the parameters, for views of crowds, in space, and outside matplotlib. All other ψ must be evaluated: see
-`consat.views.figures.regions`.
+`consat.views.regions.regions`.
 """
 
 from __future__ import annotations
