@@ -164,6 +164,8 @@ class Memory:
 
     def append(self, rows: Rows) -> None:
         """Append steps; thins the record if it is too large, and then doubles `every`."""
+        if not len(rows.step):
+            return
         self._rows.append(rows)
         self._kept += sum(leaf.size for leaf in rows if leaf is not None)
         if self._kept > MOST_KEPT and sum(len(part.step) for part in self._rows) > 2:

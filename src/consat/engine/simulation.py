@@ -90,7 +90,7 @@ class RoundsSimulation:
         return Rows(step, kept.position, None, margin, smooth_margin, kept.agent_margin, estimate, None, bound, heading)
 
     def account(self, rows: Rows) -> Mapping[str, Any]:
-        """Fields of the `Trace` that only simulations in rounds have. `rows`: the record of all rounds."""
+        """See `consat.engine.loop.Traceable`."""
         tally, period = self.tally, self.period
         return {
             "clock": "round",

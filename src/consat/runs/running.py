@@ -70,6 +70,7 @@ class Running:
         self._per, self.parameters = protocol.per, live.parameters
         self._engine = OneProcess(protocol, world, first, faults.seed, choice, None)
         self._extent = ready.size.extent / ready.size.length
+        self._well_inside = ready.size.reach - float(np.abs(ready.size.center).max(initial=0.0))
         self.ready, self.body = ready, body
         self.simulation = RoundsSimulation(team, self._engine, choice, 1.0 / body.rate)
 
@@ -117,8 +118,7 @@ class Running:
         interior = world.everyone.interior
         if interior is None or family.psi not in ADJUSTABLE:
             return
-        well_inside = size.reach - float(np.abs(size.center).max(initial=0.0))
-        if PLACES.issuperset(change.given) and all(np.abs(np.asarray(value)).max() <= well_inside for value in change.given.values()):
+        if PLACES.issuperset(change.given) and all(np.abs(np.asarray(value)).max() <= self._well_inside for value in change.given.values()):
             return  # the most frequent case
         own = {key: np.asarray(array)[[change.member]] for key, array in self.parameters[change.family].items()}
         asked = farthest(family.psi, own, np.asarray(size.center)) / size.length

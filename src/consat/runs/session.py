@@ -129,10 +129,9 @@ class Session:
         return self
 
     def _take(self, rows: Rows) -> None:
-        self._own_margins, self._stepped = None, True
-        if len(rows.step):
-            self._record.append(rows)
-            self._own_margins = rows.agent_margin[-1] if rows.step[-1] == self.round else None
+        self._record.append(rows)
+        recorded = len(rows.step) and rows.step[-1] == self.round
+        self._own_margins, self._stepped = rows.agent_margin[-1] if recorded else None, True
 
     @property
     def round(self) -> int:
@@ -368,11 +367,11 @@ class Session:
             trace, known=self.known, satisfied_from=trace.satisfied_from if self.satisfied else None,
             known_from=None, violated=None,  # they were counted with other constraints
         )  # fmt: skip
+        scenario = dataclasses.replace(scenario_of(team), name=self._name)
         summary = summarise(
-            dataclasses.replace(scenario_of(team), name=self._name), ready.settings, ready.schedule, ready.size, trace,
-            robots=self._options.robots, since=self._changed_at / self.rate,
-        )  # fmt: skip
-        return Result(summary, trace=trace, team=team, scenario=scenario_of(team).text)
+            scenario, ready.settings, ready.schedule, ready.size, trace, robots=self._options.robots, since=self._changed_at / self.rate
+        )
+        return Result(summary, trace=trace, team=team, scenario=scenario.text)
 
     def __repr__(self) -> str:
         team = self._running.ready.team

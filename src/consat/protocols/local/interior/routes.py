@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from consat.numerics import distinct
 from consat.problem.graphs import middles
+from consat.problem.links import pair_keys
 from consat.problem.team import Team
 from consat.protocols.estimates import Estimates
 from consat.settings import Layout
@@ -45,11 +46,10 @@ class Shared:
         """Compute the shared variables of agents with these copies."""
         count = len(copies.own)
         here, there = _tree(copies.count, copies.edges, copies.own)
-        talk = copies.holder[copies.edges].astype(np.int64)
-        keys = copies.holder[here].astype(np.int64) * count + copies.holder[there]
+        keys = pair_keys(copies.holder[np.stack([here, there], axis=1)], count)
         span = spanning_tree(count, copies.links)
-        level = np.concatenate([span[:, 0].astype(np.int64) * count + span[:, 1], span[:, 1].astype(np.int64) * count + span[:, 0]])
-        pairs = distinct(talk[:, 0] * count + talk[:, 1])
+        level = pair_keys(np.concatenate([span, span[:, ::-1]]), count)
+        pairs = distinct(pair_keys(copies.holder[copies.edges], count))
         pair = np.searchsorted(pairs, np.concatenate([keys, level]))
         position = np.concatenate([copies.position[here], np.full(len(level), count)])
         row = np.concatenate([here, np.full(len(level), -1)])
